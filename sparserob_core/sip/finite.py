@@ -422,7 +422,6 @@ class Directions:
 
 
 CLOSED_FORM, DUAL_NEWTON, HIGHS, SOLVER, NOBODY = "closed_form", "dual_newton", "highs", "solver", "nobody"
-INTERIOR = "interior_point"
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,7 +74,7 @@ KINDS: dict[str, dict[str, Any]] = {
         {**PUSHED, "initial_state": {"centre": [0.5, 0], "box": [0.02, 0.02]}},
         policy={"name": "affine", "cost": "worst"},
     ),
-    "feedback, curved": on(3, {**PUSHED, "terminal": [{"norm": {"p": 2, "radius": 0.6}}], "path": []}, policy=AFFINE),
+    "feedback, curved": on(3, {**PUSHED, "control": {"norm": {"p": 2, "radius": 2.0}}, "path": []}, policy=AFFINE),
     "feedback, infeasible": on(
         3, {**PUSHED, "disturbance": {"box": [2.0]}, "terminal": [{"box": [0.05, 0.05]}]}, policy=AFFINE
     ),

@@ -111,7 +111,8 @@ ANSWERED = {
     **KNOWN,
     "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
     "initial_state": {"centre": [-0.5, 0.2], "box": [0.02, 0.01]},
-    "control_step": {"box": 0.8},
+    "terminal": [{"box": 1.0}],
+    "control_step": {"norm": {"p": 2, "radius": 0.8}},
     "control": {"box": 1.0},
 }
 

@@ -4,9 +4,9 @@ share no code with the package (tests/support/policies.py); and `check` of every
 There are 61, of which the second stage takes a share (tests/support/draws.py); ``SPARSEROB_FIRST_POLICY`` is the number
 of the first. 39, 57 and 58 ended in a traceback once, 60 in a bound that its multipliers did not prove, the `check` of
 5, 7, 10, 43, 45 and 55 in no answer, and that of 960 refused an honest bound: units far from 1. Beside them are 24 with
-all features together, from ``SPARSEROB_FIRST_RICH_POLICY`` on, and 20 with largest efforts, fixed final states, plans
-that begin again and curved paths in turn. Of these `check` could not tell 6000001 and 6000011,
-and refused 6000002, 6000026 and 6000055.
+all features together, from ``SPARSEROB_FIRST_RICH_POLICY`` on, and 20 with largest efforts, fixed final states and
+plans that begin again in turn. Of these `check` could not tell 6000001 and 6000011, and refused 6000002, 6000026 and
+6000055.
 """
 
 from __future__ import annotations

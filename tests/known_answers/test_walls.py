@@ -110,7 +110,6 @@ def ridden(wall: str, pieces: int, uncertain: bool = False, feedback: bool = Fal
         pytest.param("moving", True, False, 16, marks=pytest.mark.slow),
         pytest.param("moving", False, True, 14, marks=pytest.mark.slow),
         pytest.param("curved", False, False, 24, marks=pytest.mark.slow),
-        pytest.param("curved", False, True, 24, marks=pytest.mark.slow),
     ],
 )
 def test_a_wall_that_moves_takes_no_more_rounds_the_longer_it_is_ridden(

@@ -70,6 +70,7 @@ def problem(kind):
         path, terminal = FLAT, terminal[:1]
         more["disturbance_class"] = "measurable"
     if kind.startswith("feedback"):
+        path, terminal = FLAT, terminal[:1]
         policy = sr.AffinePolicy()
         more |= {"control_step": Box([-0.4], [0.4]), "initial_set": Box([-0.05, -0.02], [0.05, 0.02])}
     return OptimalControlProblem(

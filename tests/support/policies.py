@@ -38,7 +38,7 @@ from tests.support.instances import (
 )
 
 FURTHER = 6 * TOGETHER  # numbers of policies with one of `KINDS` among their features
-KINDS = ("worst", "fixed", "repeat", "curved", "curved")  # by the last digit; curved ones stand twice
+KINDS = ("worst", "fixed", "repeat", "worst", "repeat")  # by the last digit
 ROUND = 5 * TOGETHER  # numbers of policies among whose sets of deviations there are ellipsoids
 LARGER = 2.0  # times the disturbance that open loops are tested with
 PER_PIECE = 8
@@ -112,14 +112,12 @@ def answered(number: int) -> Answered:
 
 def together(number: int) -> Answered:
     """Initial states, drift, delay, two modes, moving and mixed walls, steps, squares and groups, outputs with noise
-    and latency, unequal pieces and waves, curved goals and controls, each or not, in one problem."""
+    and latency, unequal pieces and waves, curved controls, each or not, in one problem."""
     rng = np.random.default_rng([number, 40])
     while True:
         problem = drawn(rng)
         K, d = len(problem.edges) - 1, len(problem.A)
-        flat = all(isinstance(one, Flat) for one, _, _ in problem.path) and (
-            d <= 2 or all(isinstance(one, Flat) for one in problem.terminal)
-        )
+        flat = all(isinstance(one, Flat) for one in [*problem.terminal, *(one for one, _, _ in problem.path)])
         if flat and 3 <= K <= 8 and d <= 3 and problem.ends_at is None and not problem.slopes and problem.terminal:
             break
     m, equal = len(problem.weights), np.ptp(np.diff(problem.edges)) < 1e-12
@@ -156,9 +154,6 @@ def _fits(problem: Instance, kind: str) -> bool:
     if problem.dictionary != "piecewise_constant" or problem.slopes or d > 3:
         return False
     flat = all(isinstance(one, Flat) for one in [*problem.terminal, *(one for one, _, _ in problem.path)])
-    if kind == "curved":
-        disc = all(one.p == 2.0 for one, _, _ in problem.path if isinstance(one, Curved))
-        return K <= 8 and d <= 2 and not flat and disc and problem.ends_at is None and bool(problem.path)
     if kind == "fixed":
         return K <= 8 and flat and problem.ends_at is not None
     small = {"worst": K <= 5, "repeat": K <= 8}[kind]
@@ -178,8 +173,8 @@ def _fuller(rng: np.random.Generator, problem: Instance, kind: str, has: np.ndar
 
 
 def further(number: int) -> Answered:
-    """One of `KINDS` in turn: a cost of the largest effort, fixed final states, a plan that begins again, curved
-    sets on the path; beside it what `together` draws, as far as the truth is a program."""
+    """One of `KINDS` in turn: a cost of the largest effort, fixed final states, a plan that begins again;
+    beside it what `together` draws, as far as the truth is a program."""
     rng, kind = np.random.default_rng([number, 42]), KINDS[number % len(KINDS)]
     problem = drawn(rng)
     while not _fits(problem, kind):

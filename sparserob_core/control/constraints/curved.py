@@ -349,11 +349,6 @@ class CurvedConstraint(StateConstraint):
         return {} if self._shareable_constraint is None else self._shareable_constraint._combinations
 
     @property
-    def outer(self) -> FlatConstraint:
-        """The half-spaces of sampled directions: an outer polytope of the set."""
-        return self._outer_constraint
-
-    @property
     def _shareable_constraint(self) -> CurvedConstraint | None:
         """The ``shared`` constraint where it is the same but for its initial state."""
         shared = self.shared

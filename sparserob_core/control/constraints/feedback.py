@@ -12,6 +12,7 @@ from sparserob_core.control.constraints.control import Places
 from sparserob_core.control.constraints.explanation import ConstraintSource, TimedExplanation, combination
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.local_maxima import local_maxima
+from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop
 from sparserob_core.control.feedback.loop_bounds import LoopBounds
 from sparserob_core.control.feedback.loop_rows import LoopRows, shared
@@ -117,6 +118,12 @@ class FeedbackConstraint(ConstraintSource):
     loop: ClosedLoop
     exact: bool = False
     """True for an equality, whose second half of rows are the opposites of the first half."""
+
+    @staticmethod
+    def of(constraint: StateConstraint, loop: ClosedLoop) -> FeedbackConstraint:
+        """Return a constraint on the state under feedback; its set has flat sides, since others are refused."""
+        assert isinstance(constraint, FlatConstraint)
+        return FeedbackConstraint(constraint, loop)
 
     @property
     def name(self) -> str:

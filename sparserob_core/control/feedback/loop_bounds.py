@@ -30,7 +30,7 @@ class LoopBounds:
         added_terms: tuple[Array, Array] | None = None,
     ) -> tuple[Array, Array]:
         """Return upper bounds ``(k, r)`` of ``max_w H x(t)`` over cells of time ``[lower, upper] (k,)``, each within
-        one piece of the grid, for ``H (r, d)`` or ``(k, r, d)``; and the part of each that is due to the length of the
+        one piece of the grid, for ``H (r, d)``; and the part of each that is due to the length of the
         cell. ``added_terms``: terms that are added at both ends, ``(k, r, 1 + Q)`` or ``(k, r, 1)`` each, and linear
         between.
 

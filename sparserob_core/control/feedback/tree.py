@@ -3,10 +3,10 @@ signals did.
 
 Let ``w_1 .. w_S`` be signals of the disturbance's set. Whatever a causal policy does, its controls on piece ``k`` under
 two of them are equal unless the signals differ before ``tau_k``. A difference within the piece comes too late, and a
-policy that sees less than the disturbance itself can do no more. Where a noise hides the difference, they are equal for
-longer (`knowledge`). So the controls under the signals are a point of a linear program, the tree of the signals. Its
-value is a lower bound of the cost of every causal policy with this dictionary, affine or not. These are the scenarios
-of Hadjiyiannis, Goulart and Kuhn (2011), who have two stages; here there is every stage, and finitely many times.
+policy that sees less than the disturbance itself can do no more (`knowledge`). So the controls under the signals are a
+point of a linear program, the tree of the signals. Its value is a lower bound of the cost of every causal policy with
+this dictionary, affine or not. These are the scenarios of Hadjiyiannis, Goulart and Kuhn (2011), who have two stages;
+here there is every stage, and finitely many times.
 
 Most signals need no variables. Take a signal that leaves one of the tree at a report, and is the worst for one row from
 there on. The controls that can know of it respond as is best for that row: the least of a linear function over the set
@@ -37,7 +37,7 @@ ROOM = 1.0  # how far a row may be kept within its limit, of its size
 @dataclass(frozen=True, eq=False)
 class Sampled:
     """Constraints on the state at finitely many times: ``T u + N z <= b`` for the control ``u (m, K)`` and deviations
-    ``z (Q,)`` of disturbance and initial state; ``T (R, m, K)``, ``N (R, Q)``, ``b (R,)``. Of every row its
+    ``z (Q,)`` of the disturbance; ``T (R, m, K)``, ``N (R, Q)``, ``b (R,)``. Of every row its
     ``constraint`` and ``side``, by number, and its ``time``."""
 
     T: Array
@@ -50,7 +50,7 @@ class Sampled:
     @staticmethod
     def of(loop: ClosedLoop, constraints: list[tuple[Array, Array, Array]]) -> Sampled:
         """Return the rows of constraints ``H x(t) <= h``, each given as ``(H, h, times)``, for the control and the
-        deviations of a loop."""
+        disturbances of a loop."""
         blocks: list[tuple[np.ndarray, ...]] = []
         response, K = loop.functionals.response, loop.functionals.dictionary.pieces
         for number, (H, h, times) in enumerate(constraints):
@@ -62,10 +62,9 @@ class Sampled:
             constant = constant + np.einsum("rli,li->r", on_noise, loop.middles)
             T = loop.functionals.on_decision(weights).reshape(row_times.size, -1, K)
             N = np.einsum("rli,liq->rq", on_noise, loop.entries[..., : loop.noise.start])
-            N = np.concatenate([N, free @ loop.begins[:, loop.spread.size - int(loop.begins.sum()) :]], axis=1)
             limits, numbers = h[side] - constant, np.full(row_times.size, number)
             blocks.append((T, N, limits, numbers, side, row_times))
-        m, Q = loop.answers.shape[1], loop.noise.start + int(loop.begins.sum())
+        m, Q = loop.answers.shape[1], loop.noise.start
         if not blocks:
             none = np.zeros(0, dtype=int)
             return Sampled(np.zeros((0, m, K)), np.zeros((0, Q)), np.zeros(0), none, none, np.zeros(0))
@@ -364,5 +363,5 @@ class Tree:
         if self.priced:
             offsets = offsets - found.x[0] * self.units[:, None]
         offsets = np.where(reports <= knowledge.past_reports[:, None], offsets, -np.inf)
-        excess = offsets + scale * knowledge.gives(np.array(self.signals), offsets / scale)
+        excess = offsets + scale * knowledge.bound_contributions(np.array(self.signals))
         return np.asarray(excess / self.units[:, None])

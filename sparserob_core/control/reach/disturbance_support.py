@@ -413,7 +413,7 @@ def _propagate_disturbance(past: Past, disturbance: DisturbanceModel) -> Propaga
 
 
 def over_faces(
-    space: TaylorSpace, ends: Array, parts: Callable[[np.ndarray, Face | None], Array]
+    space: TaylorSpace, ends: Array, parts: Callable[[np.ndarray | slice, Face | None], Array]
 ) -> tuple[Array, Array]:
     """Return coefficients ``(k, r, M)`` and excess ``(k, r)`` where every functional has its own pattern of ``ends``.
 
@@ -425,7 +425,7 @@ def over_faces(
         Patterns ``(k, r, nu)``: -1 or 1 for a parameter at an end of the cell, else 0.
     parts : Callable
         ``parts(selection, face)`` gives coefficients and excess as ``(k', r, M + 1)`` on one face of the cell, for the
-        times at ``selection``, a mask or indices.
+        times at ``selection``, a mask or a slice.
 
     Returns
     -------
@@ -433,7 +433,7 @@ def over_faces(
         The coefficients and the excess.
     """
     if not space.nu:
-        values = parts(np.arange(ends.shape[0]), None)
+        values = parts(slice(None), None)
         return values[..., :-1], values[..., -1]
     k, r, _ = ends.shape
     patterns, pattern_indices = distinct_patterns(ends)

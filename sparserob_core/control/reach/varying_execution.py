@@ -561,9 +561,8 @@ class SpreadExecutionSupport:
 
     @cached_property
     def effect_bounds(self) -> Array:
-        """Bounds ``(K, d)`` of `Support.effect_bounds`, times ``1 + M``, as the sums over ``M`` coefficients round
-        more."""
-        return np.asarray((1.0 + self.motion.space.size) * self.motion.folded(self.every.effect_bounds))
+        """Bounds ``(K, d)`` of `Support.effect_bounds`."""
+        return self.motion.folded(self.every.effect_bounds)
 
     @cached_property
     def _curvature_bounds(self) -> Array:

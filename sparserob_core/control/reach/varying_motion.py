@@ -19,7 +19,7 @@ the state, and that of ``[B E]`` times inputs.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from math import factorial
 
@@ -408,12 +408,28 @@ class VaryingMotion:
         """The numbers of all pieces."""
         return np.arange(self.origin.size)
 
+    @property
+    def motion(self) -> VaryingMotion:
+        """The motion of all coefficients, which is this one."""
+        return self
+
+    def along_cell(self, rows: Array) -> Array:
+        """Rows ``(r, d)`` as those of every coefficient, on all coefficients: they are the same."""
+        return rows
+
+    def folded(self, sizes: Array) -> Array:
+        """Return the bounds ``(K, d)`` of states with these bounds of all coefficients: they are the same."""
+        return sizes
+
+    def bound_truncation(self, sizes: Array, inputs: Array) -> Array:
+        """Return `SpreadMotion.bound_truncation`, which is 0 for a known system."""
+        return np.zeros(sizes.shape)
+
     def supports(
         self, model: DisturbanceModel | None, initial: ConvexSet | None, rows: Array, joined: Combination | None
     ) -> list[VaryingSupport]:
         """Return the supports of a disturbance and of deviations of the initial state, as far as there are any."""
-        supports = [] if model is None else [VaryingSupport.of_disturbance(self, model, rows, joined)]
-        return supports if initial is None else [*supports, VaryingSupport.of_initial(self, initial, rows, joined)]
+        return _list_supports(self, model, initial, rows, joined)
 
     def _slice_inputs(self, m: int) -> slice:
         return slice(self.states, self.states + m)
@@ -497,15 +513,15 @@ def _count_terms(pace: float) -> int:
 @dataclass(frozen=True, eq=False)
 class VaryingSupport:
     """The support function of a part of the uncertainty on functionals ``rows (r, d)`` of a system that changes with
-    time, in the form of `DisturbanceSupport` for a known system.
+    time, over a cell of parameters where it has any, in the form of `DisturbanceSupport` for a known system.
 
-    ``effect (K + 1, d, P, w)`` is the effect of its ``P`` components on the state until every mark. ``blocks`` takes
-    weights ``(..., P, w)`` on the components to weights ``(..., nb, q)`` on the blocks, each of which is in ``set``.
-    ``radii (w,)`` bounds the entries of a component. ``lasts``: the components act one after another, each on its piece
-    of the propagator's grid, through ``E``.
+    ``effect (K + 1, states, P, w)`` is the effect of its ``P`` components on all coefficients of the state until every
+    mark. ``blocks`` takes weights ``(..., P, w)`` on the components to weights ``(..., nb, q)`` on the blocks, each of
+    which is in ``set``. ``radii (w,)`` bounds the entries of a component. ``lasts``: the components act one after
+    another, each on its piece of the propagator's grid, through ``E``.
     """
 
-    motion: VaryingMotion
+    cell: VaryingMotion | SpreadMotion
     set: ConvexSet
     effect: Array
     blocks: Callable[[Array], Array]
@@ -516,24 +532,28 @@ class VaryingSupport:
 
     @staticmethod
     def of_disturbance(
-        motion: VaryingMotion, model: DisturbanceModel, rows: Array, combination: Combination | None
+        cell: VaryingMotion | SpreadMotion, model: DisturbanceModel, rows: Array, combination: Combination | None
     ) -> VaryingSupport:
         """Return the support of the worst disturbance on functionals ``rows (r, d)``."""
         radii = model.bound.reach(np.eye(model.channels))
-        return VaryingSupport(motion, model.set, motion.of_disturbance, model.blocks, radii, True, rows, combination)
+        effect = cell.motion.of_disturbance
+        return VaryingSupport(cell, model.set, effect, model.blocks, radii, True, rows, combination)
 
     @staticmethod
     def of_initial(
-        motion: VaryingMotion, bound: ConvexSet, rows: Array, combination: Combination | None
+        cell: VaryingMotion | SpreadMotion, bound: ConvexSet, rows: Array, combination: Combination | None
     ) -> VaryingSupport:
         """Return the support of the worst deviation of the initial state on functionals ``rows (r, d)``.
 
-        The deviation is one block that acts at time 0.
+        The deviation is one block that acts at time 0, one of the constant coefficient alone.
         """
-        radii = bound.reach(np.eye(bound.dimension))
-        return VaryingSupport(
-            motion, bound, motion.of_initial, lambda weights: weights, radii, False, rows, combination
-        )
+        radii, effect = bound.reach(np.eye(bound.dimension)), cell.motion.of_initial[..., : cell.states]
+        return VaryingSupport(cell, bound, effect, lambda weights: weights, radii, False, rows, combination)
+
+    @property
+    def motion(self) -> VaryingMotion:
+        """The motion of all coefficients of the state."""
+        return self.cell.motion
 
     def steepness(self, times: Array) -> Array:
         """`Support.steepness`."""
@@ -545,43 +565,59 @@ class VaryingSupport:
         return over_faces(
             self._space,
             ends,
-            lambda selection, face: summed(self.set, self._weigh_blocks(times[selection]), face).sum(axis=2),
+            lambda selection, face: summed(self.set, self._weigh_blocks(times)[selection], face).sum(axis=2),
         )
 
     def deviation(self, start: Array, widths: Array) -> Array:
-        """`Support.deviation`: as `VaryingMotion.deviation`, for every block."""
-        motion, d = self.motion, self.motion.states
+        """`Support.deviation`: as `VaryingMotion.deviation`, for every block, of every coefficient on the cell."""
+        motion, d, rows = self.motion, self.motion.states, self._coefficient_rows
         pieces = np.minimum(motion.place(start), motion.origin.size - 1)
         matrices = motion.compute_curvature_matrices(start, pieces)
-        curvatures = self.weights(start, self.rows @ matrices[:, :, :d])
+        curvatures = self.weights(start, rows @ matrices[:, :, :d])
         third = motion.third[pieces]
-        change = np.einsum("kij,kj->ki", third[:, :, :d], self.effect_bounds[pieces])
+        change = np.einsum("kij,kj->ki", third[:, :, :d], self._coefficient_bounds[pieces])
         if self.lasts:
             columns = slice(matrices.shape[2] - self.radii.size, None)
-            curvatures[np.arange(start.size), :, motion.origin[pieces]] += self.rows @ matrices[:, :, columns]
+            curvatures[np.arange(start.size), :, motion.origin[pieces]] += rows @ matrices[:, :, columns]
             change = change + third[:, :, columns] @ self.radii
         exact = self.set.reach(self.blocks(curvatures)).sum(axis=2)
         change = widths[:, None] * change
         change = change + rounding(motion.terms + curvatures[0, 0].size) * np.einsum(
-            "kij,kj->ki", motion.second[pieces][:, :, :d], self.effect_bounds[pieces]
+            "kij,kj->ki", motion.second[pieces][:, :, :d], self._coefficient_bounds[pieces]
         )
-        row_curvature = exact + change @ np.abs(self.rows).T
+        row_curvature = (exact + change @ np.abs(rows).T) * OUTWARD
+        row_curvature = row_curvature.reshape(start.size, len(self.rows), -1).sum(axis=2)
         return np.asarray((widths**2 / 8)[:, None] * row_curvature * OUTWARD)
 
     @cached_property
     def neglected(self) -> Array:
-        """Bounds ``(r, K)`` of the error of the functionals on every piece, from the error of the transitions and the
-        rounding of the sums over the blocks."""
-        motion, sizes = self.motion, self.sizes
-        forcing = np.zeros((sizes.shape[0] - 1, 1, 1))
+        """Bounds ``(r, K)`` of the error of the functionals on every piece, from the error of the transitions, the
+        rounding of the sums over the blocks, and the terms beyond the degree of the expansion in parameters."""
+        motion, start_sizes = self.motion, self.sizes[:-1]
+        forcing = np.zeros((len(start_sizes), 1, 1))
+        inputs = np.zeros((len(start_sizes), motion.law_bounds.shape[2] - motion.states))
         if self.lasts:
             forcing = motion.flow.sizes[..., -self.radii.size :] * self.radii
-        total = motion.bound_state_errors(sizes[:-1], forcing) + rounding(self.effect[0, 0].size) * self.effect_bounds
-        return product(np.abs(self.rows), total.T)
+            inputs[:, -self.radii.size :] = self.radii
+        state_errors = motion.bound_state_errors(start_sizes, forcing)
+        total = state_errors + rounding(self.effect[0, 0].size) * self._coefficient_bounds
+        errors = product(np.abs(self._coefficient_rows), total.T).reshape(len(self.rows), -1, len(total)).sum(axis=1)
+        truncation = self.cell.bound_truncation(start_sizes + state_errors, inputs)
+        return np.asarray((errors + product(np.abs(self.rows), truncation.T)) * OUTWARD)
 
     @cached_property
     def effect_bounds(self) -> Array:
         """Bounds ``(K, d)`` of the effect of this part of the uncertainty on every state on every piece."""
+        return self.cell.folded(self._coefficient_bounds)
+
+    @cached_property
+    def _coefficient_rows(self) -> Array:
+        """The functionals as rows ``(r M, states)`` of every coefficient on the cell, on all coefficients."""
+        return self.cell.along_cell(self.rows)
+
+    @cached_property
+    def _coefficient_bounds(self) -> Array:
+        """Bounds ``(K, states)`` of the effect of this part of the uncertainty on all coefficients on every piece."""
         motion, sizes = self.motion, self.sizes[:-1]
         lengths = motion.grid.lengths
         if self.lasts:
@@ -590,21 +626,30 @@ class VaryingSupport:
 
     @cached_property
     def sizes(self) -> Array:
-        """Bounds ``(K + 1, d)`` of the effect of this part of the uncertainty on every state at the marks."""
+        """Bounds ``(K + 1, states)`` of the effect of this part of the uncertainty on all coefficients at the marks."""
         return np.asarray(np.einsum("kdpw,w->kd", np.abs(self.effect), self.radii) * OUTWARD)
 
     @property
     def _space(self) -> TaylorSpace:
-        return KNOWN if self.combination is None else self.combination.space
+        return self.cell.space if self.combination is None else self.combination.space
 
     def _weigh_blocks(self, times: Array) -> Array:
-        """Taylor coefficients ``(k, r, M, nb, q)`` of what the functionals give to every block."""
-        rows = np.broadcast_to(self.rows, (times.size, *self.rows.shape))
-        coefficients = self.blocks(self.weights(times, rows))[:, :, None]
-        return coefficients if self.combination is None else self.combination.apply(coefficients)
+        """Taylor coefficients ``(k, r, M, nb, q)`` of what the functionals give to every block; those of the last times
+        are remembered."""
+        if self._last_weights.get("times") is not times:
+            rows = np.broadcast_to(self._coefficient_rows, (times.size, *self._coefficient_rows.shape))
+            blocks = self.blocks(self.weights(times, rows))
+            coefficients = blocks.reshape(times.size, len(self.rows), self.cell.space.size, *blocks.shape[2:])
+            coefficients = coefficients if self.combination is None else self.combination.apply(coefficients)
+            self._last_weights.update(times=times, coefficients=coefficients)
+        return self._last_weights["coefficients"]
+
+    @cached_property
+    def _last_weights(self) -> dict[str, Array]:
+        return {}
 
     def weights(self, times: Array, rows: Array) -> Array:
-        """Return the weights ``(k, r, P, w)`` of rows ``(k, r, d)`` at times ``(k,)`` on every component of the
+        """Return the weights ``(k, r, P, w)`` of rows ``(k, r, states)`` at times ``(k,)`` on every component of the
         uncertainty."""
         motion, mark_indices = self.motion, self.motion.place(times)
         shape = self.effect.shape[2:]
@@ -620,6 +665,18 @@ class VaryingSupport:
             pieces = motion.origin[np.minimum(mark_indices, motion.origin.size - 1)]
             weights[np.arange(times.size), :, pieces] += rows @ flow.disturbance
         return weights
+
+
+def _list_supports(
+    cell: VaryingMotion | SpreadMotion,
+    model: DisturbanceModel | None,
+    initial: ConvexSet | None,
+    rows: Array,
+    joined: Combination | None,
+) -> list[VaryingSupport]:
+    """Return the supports of a disturbance and of deviations of the initial state, as far as there are any."""
+    supports = [] if model is None else [VaryingSupport.of_disturbance(cell, model, rows, joined)]
+    return supports if initial is None else [*supports, VaryingSupport.of_initial(cell, initial, rows, joined)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -825,10 +882,9 @@ class SpreadMotion:
 
     def supports(
         self, model: DisturbanceModel | None, initial: ConvexSet | None, rows: Array, joined: Combination | None
-    ) -> list[SpreadSupport]:
+    ) -> list[VaryingSupport]:
         """Return `VaryingMotion.supports` over the cell."""
-        supports = [] if model is None else [SpreadSupport.of_disturbance(self, model, rows, joined)]
-        return supports if initial is None else [*supports, SpreadSupport.of_initial(self, initial, rows, joined)]
+        return _list_supports(self, model, initial, rows, joined)
 
     @property
     def motion(self) -> VaryingMotion:
@@ -910,102 +966,15 @@ class SpreadMotion:
         return np.tile(rows, self.space.size)
 
     def folded(self, sizes: Array) -> Array:
-        """Return the bounds ``(K, d)`` of states with bounds ``sizes (K, states)`` of all coefficients."""
-        return np.asarray(sizes.reshape(len(sizes), self.space.size, -1).sum(axis=1) * OUTWARD)
+        """Return the bounds ``(K, d)`` of states with bounds ``sizes (K, states)`` of all coefficients, times
+        ``1 + M``, as the sums over ``M`` coefficients round more."""
+        sums = sizes.reshape(len(sizes), self.space.size, -1).sum(axis=1)
+        return np.asarray((1.0 + self.space.size) * OUTWARD * sums)
+
+    def bound_truncation(self, sizes: Array, inputs: Array) -> Array:
+        """Return bounds ``(K, d)`` of the truncation error of states with ``sizes (K, states)`` of all coefficients at
+        the beginning of every piece, under inputs of at most ``inputs (K, m + mw)``."""
+        return self.truncation.bound_error(sizes, inputs)
 
     def _separate_coefficients(self, states: Array) -> Array:
         return states.reshape(len(states), self.space.size, self.states)
-
-
-@dataclass(frozen=True, eq=False)
-class SpreadSupport:
-    """A part of the uncertainty on functionals ``rows (r, d)`` over a cell of parameters, from its effect on all
-    coefficients on the cell, a `VaryingSupport`."""
-
-    motion: SpreadMotion
-    every: VaryingSupport
-    rows: Array
-    combination: Combination | None = None
-
-    @staticmethod
-    def of_disturbance(
-        motion: SpreadMotion, model: DisturbanceModel, rows: Array, combination: Combination | None
-    ) -> SpreadSupport:
-        """Return the support of the worst disturbance on functionals ``rows (r, d)`` over a cell of parameters."""
-        support = VaryingSupport.of_disturbance(motion.motion, model, motion.along_cell(rows), None)
-        return SpreadSupport(motion, support, rows, combination)
-
-    @staticmethod
-    def of_initial(
-        motion: SpreadMotion, bound: ConvexSet, rows: Array, combination: Combination | None
-    ) -> SpreadSupport:
-        """Return the support of the worst deviation of the initial state on functionals ``rows (r, d)`` over a cell of
-        parameters.
-
-        The deviation is one of the constant coefficient alone.
-        """
-        support = VaryingSupport.of_initial(motion.motion, bound, motion.along_cell(rows), None)
-        support = replace(support, effect=support.effect[..., : motion.states])
-        return SpreadSupport(motion, support, rows, combination)
-
-    def steepness(self, times: Array) -> Array:
-        """`Support.steepness`."""
-        sizes = self.every.set.reach(self._weigh_blocks(times)).sum(axis=3)
-        return np.asarray(sizes @ self._space.exponents)
-
-    def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
-        """`Support.at`."""
-        return over_faces(
-            self._space,
-            ends,
-            lambda selection, face: summed(self.every.set, self._weigh_blocks(times)[selection], face).sum(axis=2),
-        )
-
-    def deviation(self, start: Array, widths: Array) -> Array:
-        """`Support.deviation`, of every coefficient on the cell."""
-        bounds = self.every.deviation(start, widths)
-        return np.asarray(bounds.reshape(start.size, len(self.rows), -1).sum(axis=2) * OUTWARD)
-
-    @cached_property
-    def neglected(self) -> Array:
-        """Bounds ``(r, K)`` of `Support.neglected`, with the truncation error beyond the degree."""
-        motion, start_sizes = self.motion, self.every.sizes[:-1]
-        inputs, forcing = (
-            np.zeros((len(start_sizes), motion.motion.law_bounds.shape[2] - motion.motion.states)),
-            np.zeros((len(start_sizes), 1, 1)),
-        )
-        if self.every.lasts:
-            inputs[:, -self.every.radii.size :] = self.every.radii
-            forcing = motion.motion.flow.sizes[..., -self.every.radii.size :] * self.every.radii
-        truncation = motion.truncation.bound_error(
-            start_sizes + motion.motion.bound_state_errors(start_sizes, forcing), inputs
-        )
-        remainders = self.every.neglected.reshape(len(self.rows), self.motion.space.size, -1).sum(axis=1)
-        return np.asarray((remainders + np.abs(self.rows) @ truncation.T) * OUTWARD)
-
-    @cached_property
-    def effect_bounds(self) -> Array:
-        """Bounds ``(K, d)`` of `Support.effect_bounds`, times ``1 + M``, as the sums over ``M`` coefficients round
-        more."""
-        return (1.0 + self.motion.space.size) * self.motion.folded(self.every.effect_bounds)
-
-    @property
-    def _space(self) -> TaylorSpace:
-        return self.motion.space if self.combination is None else self.combination.space
-
-    def _weigh_blocks(self, times: Array) -> Array:
-        """Taylor coefficients ``(k, r, M, nb, q)`` of what the functionals give to every block; those of the last times
-        are remembered."""
-        if self._last_weights.get("times") is not times:
-            rows = np.broadcast_to(self.every.rows, (times.size, *self.every.rows.shape))
-            coefficients = self.every.blocks(self.every.weights(times, rows))
-            coefficients = coefficients.reshape(
-                times.size, len(self.rows), self.motion.space.size, *coefficients.shape[2:]
-            )
-            coefficients = coefficients if self.combination is None else self.combination.apply(coefficients)
-            self._last_weights.update(times=times, found=coefficients)
-        return self._last_weights["found"]
-
-    @cached_property
-    def _last_weights(self) -> dict[str, Array]:
-        return {}

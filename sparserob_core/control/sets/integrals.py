@@ -144,7 +144,8 @@ def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) 
         high = bound.support(points).mean(axis=1) * lengths
         is_open = (high - low > accuracy[owner]) & (halving < HALVINGS)
         np.add.at(total, owner[~is_open], np.stack([low, high], axis=1)[~is_open])
-        points, owner = _halve_polynomials(points[is_open]), np.tile(owner[is_open], 2)
+        points, owner = points[is_open], np.tile(owner[is_open], 2)
+        points = _split_polynomials(points, np.full(len(points), 0.5))
         lengths = np.tile(lengths[is_open] / 2, 2)
         if not owner.size:
             break
@@ -216,18 +217,19 @@ def _split_polynomials(points: Array, at: Array) -> Array:
 
     Parameters
     ----------
-    points : array (l, p + 1)
+    points : array (l, p + 1, ...)
         The Bernstein coefficients on ``[0, 1]``.
     at : array (l,)
         The point of division of each polynomial.
 
     Returns
     -------
-    array (2 l, p + 1)
+    array (2 l, p + 1, ...)
         The coefficients on the left parts, followed by those on the right parts.
     """
     left, right, row, last = np.empty_like(points), np.empty_like(points), points, points.shape[1] - 1
-    share, complement = at[:, None], 1.0 - at[:, None]
+    share = at.reshape(-1, *([1] * (points.ndim - 1)))
+    complement = 1.0 - share
     for order in range(last + 1):
         left[:, order], right[:, last - order] = row[:, 0], row[:, -1]
         row = complement * row[:, :-1] + share * row[:, 1:]
@@ -238,23 +240,3 @@ def _split_polynomials(points: Array, at: Array) -> Array:
 def bezier(order: int) -> Array:
     """Return the matrix ``(order + 1, order + 1)`` from powers on ``[0, 1]`` to Bernstein coefficients."""
     return np.array([[comb(k, j) / comb(order, j) for j in range(order + 1)] for k in range(order + 1)])
-
-
-def _halve_polynomials(points: Array) -> Array:
-    """Return Bernstein coefficients on both halves of an interval, all left halves first (de Casteljau).
-
-    Parameters
-    ----------
-    points : array (l, p + 1, w)
-        The Bernstein coefficients on the interval.
-
-    Returns
-    -------
-    array (2 l, p + 1, w)
-        The coefficients on the left halves, followed by those on the right halves.
-    """
-    left, right, row, last = np.empty_like(points), np.empty_like(points), points, points.shape[1] - 1
-    for order in range(last + 1):
-        left[:, order], right[:, last - order] = row[:, 0], row[:, -1]
-        row = (row[:, :-1] + row[:, 1:]) / 2
-    return np.concatenate([left, right])

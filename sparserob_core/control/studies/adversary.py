@@ -112,9 +112,9 @@ def _separate_in_own_units(constraint: StateConstraint, decision: Array, own: Ow
 
 
 def _find_in_closed_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> Adversary:
-    from sparserob_core.control.constraints.feedback_curved import of_state
+    from sparserob_core.control.constraints.feedback import FeedbackConstraint
 
-    robust_constraint = of_state(constraint, loop)
+    robust_constraint = FeedbackConstraint.of(constraint, loop)
     worst = robust_constraint.worst(decision)
     row, time = int(worst.rows[0]), float(worst.indices[0, 0])
     _, directions, _, bounds = constraint.functionals_at(worst.indices[:1])

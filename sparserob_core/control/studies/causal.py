@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias, final
 import numpy as np
 
 from sparserob_core.control.constraints.flat import FlatConstraint
-from sparserob_core.control.feedback.knowledge import Knowledge, OfDisturbances, OfOutputs, extreme
+from sparserob_core.control.feedback.knowledge import Knowledge, extreme
 from sparserob_core.control.feedback.tree import Grown, Sampled, Tree
 from sparserob_core.control.policies.policy import Charge
 from sparserob_core.control.transcription.record import Transcription
@@ -34,8 +34,6 @@ ANSWERED = (1.0, 1.0, 1.0, 1.0, 0.5, 0.0)
 WORK, EACH, PER = 1e7, 2e6, 3e3  # that a search may do anyway; for each of a run's programs, and for its columns
 CELLS = 2e7  # numbers of one kind about all signals of a tree: 160 MB
 INSIDE = 1  # times sampled within every piece, beside its ends and the times that the policy's bound rests on
-AGAIN = 4  # times that a noise hides its share of a smaller factor, each of which gains less than the one before
-NARROWER = 1e-4  # of a factor, by which it must have come down for that
 NEARLY = 1e-6  # of a factor, by which the first one that is excluded lies above the largest one that is not
 
 
@@ -69,10 +67,6 @@ class CausalBound:
         Reason why the search ended.
     shares : tuple of float
         Weight of the effort under every signal, with the cost ``worst``; at most 1 together.
-    outputs : tuple of ndarray, shape (K, p)
-        Measured outputs under every signal, relative to the nominal ones, where a noise hides outputs.
-    initial_states : tuple of ndarray, shape (d,)
-        Initial state of every signal, where a noise hides outputs.
     """
 
     lower: float
@@ -80,8 +74,6 @@ class CausalBound:
     rows: tuple[Weighed, ...] = ()
     ended: Ended = "settled"
     shares: tuple[float, ...] = ()
-    outputs: tuple[Array, ...] = ()
-    initial_states: tuple[Array, ...] = ()
 
 
 @final
@@ -131,7 +123,7 @@ class CausalLimits:
         signal_limit = CELLS / max(1, s.T.shape[0] * max(s.N.shape[1], s.T.shape[1] * s.T.shape[2]))
         if self.passed():
             self.ended = "seconds"
-        elif tree.work + tree.knowledge.work > self.work or len(tree.signals) > signal_limit:
+        elif tree.work > self.work or len(tree.signals) > signal_limit:
             self.ended = "work"
         elif not self.room(tree):
             self.ended = "signals"
@@ -143,12 +135,6 @@ class CausalLimits:
     def begin(self, tree: Tree) -> None:
         """Exclude the signals that the tree already holds from the count."""
         self._initial_count = len(tree.signals)
-
-    def again(self) -> None:
-        """Start the limits anew for another tree: signals and work count from 0, but the time goes on."""
-        self._initial_count = 0
-        if self.ended != "seconds":
-            self.ended = "settled"
 
     def room(self, tree: Tree) -> int:
         """Return the number of signals that may still be added to the tree; before the search begins always 1, so that
@@ -193,58 +179,23 @@ class CausalSearch:
         the disturbance does until the last measurement that is known: outputs tell no more."""
         points, measured, s = self.model.control.breakpoints, self.model.problem.measurements, self.sampled
         known_counts = np.searchsorted(self.starts, points[:-1] if measured is None else measured.latest(points))
-        N = s.N[:, : self.spread.size]
         width, block_counts = self.spread.size // max(1, self.starts.size), np.searchsorted(self.starts, s.time)
         signals = [extreme(self.spread, z) for _, _, z in self._active if z is not None and z.any()]
-        return self._build_tree(
-            OfDisturbances(N, self.spread, width, known_counts, block_counts), signals, limits, highest
-        )
-
-    def hiding(
-        self, limits: CausalLimits, other: tuple[Tree, Grown] | None, highest: float | None = None
-    ) -> Tree | None:
-        """A tree of signals that a noise hides, with those that have a multiplier in an ``other`` tree; ``None`` where
-        nothing is hidden. Noise and initial states stay what they are under all factors up to the ``highest``."""
-        points, measured, s = self.model.control.breakpoints, self.model.problem.measurements, self.sampled
-        if measured is None:
-            return None
-        known_counts, share = measured.known(points).sum(axis=1), 1.0 if highest is None else 1.0 / highest
-        knowledge = OfOutputs.of(self.loop, s.N, s.time, points[:-1], known_counts, share)
-        if knowledge is None:
-            return None
-        knowledge.limit, knowledge.passed = limits.work, limits.passed
-        signals = [other[0].signals[index] for index in np.unique(other[1].signals)] if other is not None else []
-        return self._build_tree(knowledge, signals, limits, highest)
-
-    def _build_tree(
-        self, knowledge: Knowledge, known: list[Array], limits: CausalLimits, highest: float | None
-    ) -> Tree:
-        problem, feedback = self.model.problem, self.model.answering
-        limits.again()
-        prices = problem.prices(self.model.control.breakpoints)
-        tree = Tree(self.sampled, knowledge, problem.control, prices, feedback.charge.cost, highest)
+        problem, prices = self.model.problem, self.model.problem.prices(points)
+        knowledge = Knowledge(s.N, self.spread, width, known_counts, block_counts)
+        tree = Tree(s, knowledge, problem.control, prices, self.model.answering.charge.cost, highest)
         tree.seconds = lambda: limits.seconds
         tree.add(knowledge.nominal)
-        for z in known:
+        for z in signals:
             if not limits.over(tree):
-                tree.add(knowledge.known(z))
+                tree.add(z)
         limits.begin(tree)
         return tree
 
-    def least_cost(self, cost: float, limits: CausalLimits, hides: bool = True) -> tuple[Tree, Grown, bool] | None:
+    def least_cost(self, cost: float, limits: CausalLimits) -> tuple[Tree, Grown, bool] | None:
         """The tree that was found, its multipliers, and whether they prove that no causal policy exists; ``cost``: of
-        the policy, an upper bound of what the tree can prove, infinite where none is known. First as if no noise hid
-        anything, and then, where it ``hides``, with what that took to prove."""
-        best = self._search_least_cost(self.tree(limits), cost, limits)
-        if not hides or (best is not None and best[2]):
-            return best
-        tree = self.hiding(limits, None if best is None else best[:2])
-        better = None if tree is None else self._search_least_cost(tree, cost, limits)
-        if best is None or (better is not None and (better[2] or better[1].value > best[1].value)):
-            return better
-        return best
-
-    def _search_least_cost(self, tree: Tree, cost: float, limits: CausalLimits) -> tuple[Tree, Grown, bool] | None:
+        the policy, an upper bound of what the tree can prove, infinite where none is known."""
+        tree = self.tree(limits)
         best, idle = tree.least(), 0
         while best is not None and idle < len(ANSWERED) and not limits.over(tree, idle):
             aim = cost if np.isfinite(cost) else np.inf
@@ -268,21 +219,8 @@ class CausalSearch:
         return multipliers if multipliers is not None and multipliers.value > NONE else None
 
     def largest_factor(self, highest: float, limits: CausalLimits) -> tuple[Tree, Grown] | None:
-        """The largest factor of all deviations for which the tree is feasible, with its multipliers. Of outputs with a
-        noise first as if it hid nothing, and then below the factor that was found, for which it hides its share."""
-        best = self._search_largest_factor(self.tree(limits, highest), limits)
-        for _ in range(AGAIN if best is not None else 0):
-            assert best is not None
-            tree = self.hiding(limits, best, best[1].value * (1.0 + NARROWER))
-            better = None if tree is None else self._search_largest_factor(tree, limits)
-            if better is None or better[1].value >= best[1].value:
-                break
-            narrower, best = better[1].value < best[1].value * (1.0 - NARROWER), better
-            if not narrower:
-                break
-        return best
-
-    def _search_largest_factor(self, tree: Tree, limits: CausalLimits) -> tuple[Tree, Grown] | None:
+        """The largest factor of all deviations for which the tree is feasible, with its multipliers."""
+        tree = self.tree(limits, highest)
         best, idle = tree.least(), 0
         while best is not None and idle < len(ANSWERED) and not limits.over(tree, idle):
             if not self._grow(tree, best, limits.room(tree), idle):
@@ -354,19 +292,8 @@ class CausalSearch:
             weights[index] = weights.get(index, 0.0) + float(found.shares[signal])
         total = max(1.0, sum(weights.values())) / SHARED
         shares = tuple(weights.get(index, 0.0) / total for index in range(len(deviations)) if weights)
-        signals = tuple(_place_in_set(z[: self.spread.size], disturbance, self.starts.size) for z in deviations)
-        if not isinstance(tree.knowledge, OfOutputs):
-            return CausalBound(lower, signals, tuple(rows), ended, shares)
-        outputs = tuple(tree.knowledge.outputs(z) for z in deviations)
-        initial_states = tuple(
-            self._compute_initial_state(z[self.spread.size : self.sampled.N.shape[1]]) for z in deviations
-        )
-        return CausalBound(lower, signals, tuple(rows), ended, shares, outputs, initial_states)
-
-    def _compute_initial_state(self, z: Array) -> Array:
-        """The initial state of deviations, certainly in its set."""
-        bound = self.model.problem.initial_set
-        return self.loop.start if bound is None else _place_in_set(z, bound, 1)[:, 0]
+        signals = tuple(_place_in_set(z, disturbance, self.starts.size) for z in deviations)
+        return CausalBound(lower, signals, tuple(rows), ended, shares)
 
 
 def _place_in_set(z: Array, disturbance: ConvexSet | None, blocks: int) -> Array:

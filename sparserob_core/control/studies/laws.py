@@ -251,22 +251,6 @@ class ParametersInTime:
         return all_states
 
 
-def admissibility(model: DisturbanceModel, signals: Array) -> Array:
-    """Return the residual ``(n,)`` by which disturbances ``(n, mw, L)`` on the merged grid fail to be admissible; at
-    most rounding where they are admissible."""
-    if model.starts is not None:
-        values = signals.swapaxes(1, 2)
-        uneven = np.abs(signals - model.signals(values[:, model.starts])).max(axis=(1, 2))
-        return np.asarray(np.maximum(model.bound.violation(values).max(axis=1), uneven))
-    functions = np.asarray(model.functions)
-    coefficients = signals @ np.linalg.pinv(functions)
-    outside = np.abs(coefficients @ functions - signals).max(axis=(1, 2))
-    if model.scale is not None:
-        used = np.abs(coefficients).sum(axis=2) - model.scale
-        return np.asarray(np.maximum(used.max(axis=1), outside))
-    return np.asarray(np.maximum(model.set.violation(coefficients.reshape(signals.shape[0], -1)), outside))
-
-
 def _draw_blocks(
     model: DisturbanceModel,
     count: int,

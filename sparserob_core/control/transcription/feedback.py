@@ -13,7 +13,7 @@ import numpy as np
 from sparserob_core.control.constraints.control import STEP, Places, held_at, of_control
 from sparserob_core.control.constraints.effort import FeedbackEffort
 from sparserob_core.control.constraints.feedback import FeedbackConstraint, FeedbackControl
-from sparserob_core.control.constraints.feedback_curved import FeedbackCurvedControl, of_state
+from sparserob_core.control.constraints.feedback_curved import FeedbackCurvedControl
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.feedback.closed_loop import ClosedLoop, deviations_of
@@ -24,7 +24,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.reach.sizes import widths
-from sparserob_core.control.transcription.own_units import added_up, constraint_sides, extent, fixed, units_of_steps
+from sparserob_core.control.transcription.own_units import added_up, constraint_sides, fixed, units_of_steps
 from sparserob_core.control.transcription.program import EQUALS, ranges, transcribed
 from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import Acting, Feedback, Posed, ProgramPart, Transcription
@@ -150,7 +150,7 @@ class FeedbackModel(Acting):
             anew=_has_next_initial_state(posed),
         )
         system, horizon = functionals.response.system, problem.horizon
-        families = [of_state(constraint, loop).family() for constraint in posed.constraints]
+        families = [FeedbackConstraint.of(constraint, loop).family() for constraint in posed.constraints]
         settle_functions: list[Callable[[Array], Array]] = []
         if measurements.fixed[1].size:
             ends = (problem.horizon, problem.horizon)
@@ -163,7 +163,7 @@ class FeedbackModel(Acting):
         for name, convex, places in held_at(problem, breakpoints, answering=True):
             flat = convex.halfspaces()
             if flat is None:
-                families.append(FeedbackCurvedControl(loop, convex, name, places).family())
+                families.append(FeedbackCurvedControl(name, loop, places, convex).family())
                 continue
             H, h = flat
             if places.steps and measurements.steps is not None:
@@ -273,6 +273,8 @@ def refuse(
     named = [entry.name for entry in paths if entry.name in (of_control(problem), PEAK, EFFORT, EQUALS, STEP)]
     uncertainty = [convex for convex in (problem.disturbance, problem.initial_set) if convex is not None]
     slanted = [convex.kind for convex in uncertainty if _has_zero_chord(convex)]
+    state_sets = [*(entry.set for entry in problem.of_states), *problem.terminal_sets]
+    curved = [convex.kind for convex in state_sets if convex.halfspaces() is None]
     leaning = [convex.kind for convex in uncertainty if fixed(problem)[1].size and Spread(((1, convex),)).leans]
     finer = "; more pieces in dictionaries.disturbance come as close to a measurable one as is wanted"
     finer = finer if "measurable" in classes else ""
@@ -290,6 +292,8 @@ def refuse(
         " columns of E": bool(slanted),
         f"set of disturbances and of initial states with an interior, or of axes that are points, beside fixed final"
         f" states, which the {' and the '.join(leaning)} has not: a small box of final states does": bool(leaning),
+        f"set of states with flat sides, which the {' and the '.join(dict.fromkeys(curved))} has not: a polytope inside"
+        " of it comes as close as is wanted": bool(curved),
         "disturbance that takes any value on each of its pieces": bool(classes) and not disturbance.is_complete,
         f"path constraint of another name than {' or '.join(map(str, named))}, which is taken": bool(named),
         "whole state that is measured without noise where a plan with a control_step repeats": bool(problem.repeat)
@@ -370,18 +374,14 @@ def _combine_over_times(convex: ConvexSet, still: np.ndarray) -> np.ndarray:
 
 def _normalise_rows(constraints: Sequence[StateConstraint], d: int) -> Array:
     """Return rows ``(k, d)`` on the state in multiples of the size that a user reads from them: the larger of bound and
-    width. A curved set has one row for each axis. A row with size 0 stays in its own unit."""
+    width. A row with size 0 stays in its own unit."""
     rows = [np.zeros((0, d))]
     for constraint in constraints:
-        if constraint.sides is not None:
-            normals, (H, h) = constraint.sides[0], constraint_sides(constraint)
-            width = widths(H, h)
-            sizes = np.maximum(np.abs(h), np.where(np.isfinite(width), width, 0.0))
-        else:
-            assert constraint.shape is not None
-            normals = np.eye(constraint.shape.dimension)
-            sizes = np.maximum(extent(constraint.shape), constraint.shape.width(normals))
-        rows.append(normals / np.where(sizes > 0.0, sizes, 1.0)[:, None])
+        assert constraint.sides is not None
+        H, h = constraint_sides(constraint)
+        width = widths(H, h)
+        sizes = np.maximum(np.abs(h), np.where(np.isfinite(width), width, 0.0))
+        rows.append(constraint.sides[0] / np.where(sizes > 0.0, sizes, 1.0)[:, None])
     return np.vstack(rows)
 
 

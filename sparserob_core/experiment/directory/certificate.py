@@ -182,13 +182,11 @@ def causal_data(bound: CausalBound) -> dict[str, Any]:
 
     ``lower_bound`` is ``null`` where no policy exists. ``signals`` are disturbances ``(mw, blocks)``, and the
     ``multipliers`` belong to constraints under one of them. With the cost ``worst`` the ``shares`` are the weights of
-    the effort under every signal. Where outputs have a noise, ``outputs (K, p)`` and ``initial_states (d,)`` are those
-    of every signal. The outputs are relative to the nominal ones, and the noise is the difference that remains.
+    the effort under every signal.
     """
     return {
         "lower_bound": bound.lower if np.isfinite(bound.lower) else None,
         "signals": list(bound.signals),
-        **({"outputs": list(bound.outputs), "initial_states": list(bound.initial_states)} if bound.outputs else {}),
         **({"shares": list(bound.shares)} if bound.shares else {}),
         "multipliers": [
             {

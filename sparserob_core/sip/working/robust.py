@@ -1,9 +1,9 @@
 """Imposed rows that must hold for every deviation: indices are exchanged, deviations are all in the relaxed program.
 
-The relaxed program is the robust counterpart at the imposed indices (`inner.simplex`, or `inner.central` for many
-gains). The lower bound is that of cuts: every row with a multiplier, at the deviation that its multipliers determine
-(weak duality over the bounds of the program). Nothing is dropped: a row has variables of its own, and the last basis,
-from which the next solution starts, contains them.
+The relaxed program is the robust counterpart at the imposed indices (`inner.simplex`). The lower bound is that of
+cuts: every row with a multiplier, at the deviation that its multipliers determine (weak duality over the bounds of the
+program). Nothing is dropped: a row has variables of its own, and the last basis, from which the next solution starts,
+contains them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut, Dual, InfeasibleSubsystem
 from sparserob_core.sip.finite import FiniteSolution
-from sparserob_core.sip.inner.central.interior import Interior
 from sparserob_core.sip.inner.simplex.counterpart import Counterpart, RobustAnswer, robust_bound
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, WorstConstraint
@@ -60,7 +59,7 @@ class RobustRows(Working):
 
     Parameters
     ----------
-    counterpart : Counterpart or Interior
+    counterpart : Counterpart
         Robust counterpart at the imposed indices.
     close : Close, optional
         Exchange of another program.
@@ -86,7 +85,7 @@ class RobustRows(Working):
         Whether the guide was used.
     """
 
-    counterpart: Counterpart | Interior = field(kw_only=True)
+    counterpart: Counterpart = field(kw_only=True)
     close: Close | None = None
     cuts: list[Cut] = field(default_factory=list)
     known: set[tuple[str, bytes]] = field(default_factory=set)
@@ -120,23 +119,14 @@ class RobustRows(Working):
             The working set.
         """
         assert program.spread is not None
-        central, solver = Interior(program.finite, program.spread), ledger.relaxed.counted
-        working = RobustRows(program, counterpart=central, close=close, tolerance=ledger.tolerance)
-        working.asked = None if solver.instead is None else solver
+        solver = None if ledger.relaxed.counted.instead is None else ledger.relaxed.counted
+        counterpart = Counterpart(program.finite, program.spread, asked=solver)
+        working = RobustRows(program, counterpart=counterpart, close=close, tolerance=ledger.tolerance, asked=solver)
         for family in program.families:
             assert family.start is not None
             working.add(family, family.start)
-        if working.asked is not None or program.guide is not None or not central.fits():
-            working.by_simplex()
         ledger.improve(working.at_rest)
         return working
-
-    def by_simplex(self) -> None:
-        """Continue with the simplex method, which solves every counterpart, or with the named solver."""
-        blocks = self.counterpart.blocks
-        self.counterpart = Counterpart(self.program.finite, self.counterpart.spread, asked=self.asked)
-        for block in blocks:
-            self.counterpart.add(block)
 
     def solve(self, margin: float, accuracy: float, seconds: float = np.inf) -> RobustAnswer:
         """Return the optimum with the rows tightened by a margin.
@@ -171,16 +161,8 @@ class RobustRows(Working):
         size = program.largest_cost if ledger.best is None else size_of(program, ledger.best)
         while not (solution := self.solve(self.margin, self.accuracy * size, left(ledger.tools))).solved:
             self._record_calls(ledger)
-            if ledger.tools.deadline.passed:
-                if solution.x.size:  # the solution was interrupted: its last decision is the best known
-                    ledger.best = ledger.best or self._form_answer(ledger, solution)
-                ledger.tools.deadline.check()
-            if isinstance(self.counterpart, Interior):
-                refuted = self.refuted(solution)
-                if refuted is not None:
-                    return self._report_infeasible(ledger, solution, refuted)
-                self.by_simplex()
-            elif not self.thin():
+            ledger.tools.deadline.check()
+            if not self.thin():
                 return self._prove_infeasible(ledger, solution.said)
         self._record_calls(ledger)
         answer = self._form_answer(ledger, solution)

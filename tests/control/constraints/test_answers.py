@@ -168,7 +168,7 @@ def test_a_curved_set_holds_the_control_and_its_steps_at_every_corner(name: str,
     worst = over.max(axis=0)
     found = one.worst(x)
     assert found.violations == pytest.approx(np.sort(worst)[::-1], rel=1e-5)
-    assert found.indices[:, 0] == pytest.approx(one.source.times[np.argsort(-worst)])
+    assert found.indices[:, 0] == pytest.approx(one.source.places.times[np.argsort(-worst)])
     assert one.violations(x, found.indices)[:, 0] == pytest.approx(found.violations, abs=1e-12)
     for index, violation in zip(found.indices, found.violations, strict=True):
         assert one.uncertain(index).excess(x, spread)[0] == pytest.approx(violation, abs=1e-12)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from sparserob_core.control.constraints.curved import CurvedConstraint
-from sparserob_core.control.constraints.feedback_curved import FeedbackCurved
 from sparserob_core.control.constraints.local_maxima import MAX_RETURNED, along_spans, find_kink_neighbours, ridden
 from sparserob_core.control.reach.many_directions import ManyDirections
 from sparserob_core.control.sets.directions import sampled
@@ -129,18 +128,6 @@ def test_speeds_that_a_round_wall_hardly_limits_take_no_cells() -> None:
     pieces = {name: {"name": "piecewise_constant", "pieces": 8} for name in ("control", "disturbance")}
     family = family_of({"problem": stated, "dictionaries": pieces}, "path")
     assert prove_family(family, np.zeros(24), cells=400).verdict == "proven"
-
-
-def test_under_feedback_too_a_set_that_is_left_is_imposed_all_along() -> None:
-    family = family_of(problem("curved", 8, feedback=True), "path")
-    constraint = family.worst.__self__
-    assert isinstance(constraint, FeedbackCurved)
-    n = family.uncertain(family.start[0]).g.shape[1]
-    found = family.worst(np.zeros(n))
-    left = np.unique(np.floor(found.indices[found.violations > 0.0, 0] / 0.25))
-    assert left.size >= 5
-    for index, violation in zip(found.indices, found.violations, strict=True):
-        assert abs(family.excess(np.zeros(n), index[None])[0, 0] - violation) <= 1e-9
 
 
 def test_a_violation_that_rises_and_falls_beside_a_kink_is_met() -> None:

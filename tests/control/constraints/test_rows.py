@@ -1,4 +1,4 @@
-"""Guards control/constraints/state, literal, feedback, feedback_curved: one row of an index by itself is that of all of
+"""Guards control/constraints/state, literal, feedback: one row of an index by itself is that of all of
 them, a literal index holds the disturbance that is the worst, and deviations that are told reach what is told."""
 
 from __future__ import annotations
@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparserob_core.control.constraints.feedback_curved import of_state
+from sparserob_core.control.constraints.feedback import FeedbackConstraint
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.sets.sets import Box, Equality
@@ -97,7 +97,7 @@ def test_a_deviation_that_is_told_reaches_the_violation(kind):
         if not isinstance(source, StateConstraint):
             continue
         loop = next(f.source.loop for f in made.families if f.name == "control")
-        held = of_state(source, loop)
+        held = FeedbackConstraint.of(source, loop)
         for index in indices(one, rng, 2):
             values = one.violations(x, index[None])[0]
             for row, value in enumerate(values):

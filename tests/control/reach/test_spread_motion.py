@@ -15,6 +15,7 @@ import sparserob_core as sr
 from sparserob_core.control.enclosures import dependence
 from sparserob_core.control.enclosures.dependence import ExpandedSystem
 from sparserob_core.control.reach.varying_motion import SpreadMotion, Truncation, VaryingMotion
+from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.response import OutputResponse, Propagator, Response, merge_grids
 from sparserob_core.control.response.varying import spread as expansions
 from sparserob_core.control.response.varying.discs import cauchy
@@ -46,6 +47,40 @@ def test_what_is_beyond_a_degree_is_bounded_and_not_by_far_more_than_it_is(degre
     lost = Truncation(motion, spread).bound_error(np.abs(states[:-1]), np.zeros((marks.size - 1, 2)))[:, 0]
     assert (off[1:] <= lost * (1.0 + 1e-9) + 1e-14).all()
     assert lost[-1] <= 1e3 * off.max()
+
+
+@pytest.mark.parametrize("degree", [2, 3])
+def test_supports_over_a_cell_hold_what_is_beyond_the_degree(degree: int) -> None:
+    """A deviation of 1 of the initial state, and a disturbance of 0.2, by their closed forms at many parameters: each
+    is above the polynomial alone, and at most the polynomial with what it neglects."""
+    spread = ExpandedSystem(1, TaylorSpace(1, degree), *SYSTEM.deviations)
+    breaks = np.linspace(0.0, 3.0, 7)
+    every = Propagator(SYSTEM.superposed(spread), merge_grids(breaks, breaks, varying=True))
+    cell = SpreadMotion(Truncation(VaryingMotion(every, np.eye(spread.states)[0]), spread))
+    model = DisturbanceModel(
+        "piecewise_constant", sr.Box([-0.2], [0.2]), sr.Box([-0.2], [0.2]), every.grid, starts=np.arange(6)
+    )
+    marks, points = cell.grid.breakpoints[:-1], np.linspace(-0.3, 0.6, 31)
+    nodes, weights = np.polynomial.legendre.leggauss(24)
+    late = (marks[:, None] + nodes * marks[:, None]) / 2
+    passed = np.exp(-points[:, None, None] * (np.cos(2 * late) - np.cos(2 * marks[:, None])) / 2)
+    driven = 0.1 * marks * ((np.exp(-(marks[:, None] - late) / 2) * passed) @ weights)
+    monomials = spread.space.monomials(spread.shares(points[:, None]))
+    truths = (driven, decay(marks[None], points[:, None]))
+    inputs, forcing = np.tile([0.0, 0.2], (marks.size, 1)), 0.2 * cell.motion.flow.sizes[..., 1:]
+    entering = ((inputs, forcing), (0.0 * inputs, 0.0 * forcing))
+    supports = cell.supports(model, sr.Box([-1.0], [1.0]), np.ones((1, 1)), None)
+    for support, truth, (pushed, forced) in zip(supports, truths, entering, strict=True):
+        coefficients, excess = support.at(marks, np.zeros((marks.size, 1, 1)))
+        polynomial = monomials @ coefficients[:, 0].T + excess[:, 0]
+        neglected = support.neglected[0]
+        assert (truth <= polynomial + neglected + 1e-14).all()
+        beyond = (truth - polynomial).max()
+        assert beyond > 1e-7 and neglected[-1] <= 1e5 * beyond
+        assert (truth <= support.effect_bounds[:, 0] + neglected + 1e-14).all()
+        sizes = support.sizes[:-1]
+        steps = cell.motion.bound_state_errors(sizes, forced)
+        assert (neglected >= cell.truncation.bound_error(sizes + steps, pushed)[:, 0] + steps.sum(axis=1)).all()
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from math import comb
 import numpy as np
 import pytest
 
-from sparserob_core.control.sets.integrals import _halve_polynomials, curved_integral, enclosed
+from sparserob_core.control.sets.integrals import _split_polynomials, curved_integral, enclosed
 from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid, NormBall, Polytope, Zonotope, product
 from sparserob_core.sip.convex_set import ScaledSet
 from tests.control.sets.test_sets import ByItsSupport
@@ -169,7 +169,7 @@ def test_the_halves_of_a_polynomial_are_itself() -> None:
     def at(coefficients: np.ndarray, u: float) -> np.ndarray:
         return sum(comb(4, k) * u**k * (1 - u) ** (4 - k) * coefficients[:, k] for k in range(5))
 
-    halves = _halve_polynomials(points)
+    halves = _split_polynomials(points, np.full(len(points), 0.5))
     for u in (0.0, 0.3, 1.0):
         np.testing.assert_allclose(at(halves[:2], u), at(points, u / 2), atol=1e-14)
         np.testing.assert_allclose(at(halves[2:], u), at(points, 0.5 + u / 2), atol=1e-14)

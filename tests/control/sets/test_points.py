@@ -170,8 +170,6 @@ def test_what_is_still_is_what_no_row_feels() -> None:
     assert still(terminal=end, disturbance={"box": [1e-8, 0.03]}) == [False, False] * 4
     assert still(terminal=[{"box": [30.0, 30.0]}], disturbance={"box": [1e-8, 0.03]}) == [True, False] * 4
     assert still(terminal=end, disturbance={"zonotope": {"generators": [[1e-13, 0], [0, 0.03]]}}) == [False] * 8
-    ball = [{"norm": {"p": 2, "radius": 0.3}}]
-    assert still(terminal=ball, disturbance={"box": [1e-13, 0.03]}) == [True, False] * 4
     fixed = [{"equals": [0, 0]}]
     assert still(terminal=fixed, initial_state={"centre": [1.0, 0.0], "box": [1e-12, 0.03]}) == [False, False]
 

@@ -266,7 +266,7 @@ def test_a_limit_before_a_control_is_in_its_set_is_no_failure(monkeypatch):
         initial_state=[-1.0, 1.0],
         control=sr.NormBall(2, 0.5, [0.0, 0.0]),
         disturbance=sr.NormBall(2, 0.1, [0.0, 0.0]),
-        terminal=[sr.NormBall(2, 0.3, [0.0, 0.0])],
+        terminal=[sr.Box([-0.2, -0.2], [0.2, 0.2])],
     )
     rounds, separated = [], exchange.separate
 

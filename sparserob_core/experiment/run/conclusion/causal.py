@@ -42,18 +42,15 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
         search = CausalSearch(model, result.decision, active(model, result))
         limits = CausalLimits.of(charge, [result], model.program.n, lambda: tools.deadline.passed)
         cost = result.cost if result.status in ("certified", "verified") else np.inf
-        for hides in (True, False):  # of an unstable plant, balls may be too wide to show what a noise hides
-            solved_tree = search.least_cost(cost, limits, hides)
-            no_bound = replace(result, causal=CausalBound(-np.inf, ended=limits.ended))
-            if solved_tree is None:
-                return no_bound
-            tree, solution, excludes_all = solved_tree
-            causal_bound = search.bound(
-                tree, solution, np.inf if excludes_all else solution.value, model.problem.disturbance, limits.ended
-            )
-            derived = proven(model, model.problem, causal_bound, tools.deadline)
-            if derived is not None or not causal_bound.outputs:
-                break
+        solved_tree = search.least_cost(cost, limits)
+        no_bound = replace(result, causal=CausalBound(-np.inf, ended=limits.ended))
+        if solved_tree is None:
+            return no_bound
+        tree, solution, excludes_all = solved_tree
+        causal_bound = search.bound(
+            tree, solution, np.inf if excludes_all else solution.value, model.problem.disturbance, limits.ended
+        )
+        derived = proven(model, model.problem, causal_bound, tools.deadline)
     except KeyboardInterrupt as error:
         tools.deadline.interrupt(error)
         return result
