@@ -7,10 +7,11 @@ that depends on an index or on the decision is enclosed.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from fractions import Fraction
 from itertools import count
 
 import numpy as np
-from flint import arb
+from flint import arb, fmpq
 
 from sparserob_core.checker.arithmetic.balls import above, ball
 from sparserob_core.checker.arithmetic.bernstein import highest
@@ -72,13 +73,14 @@ def _bound_cell(
     rows: ExpressionRows, row: StatedRow, frame: Frame, decision: np.ndarray, lower: Array, upper: Array
 ) -> float:
     """Return an upper bound of the violation over one cell; infinite where the row has no enclosure there."""
-    values: dict[str, Value] = {}
-    for i, name in enumerate(rows.words.indices):
-        low, high = ball(float(lower[i])), ball(float(upper[i]))
+    coordinates: list[Value] = []
+    for i, (start, stop) in enumerate(zip(lower.tolist(), upper.tolist(), strict=True)):
+        low, high = ball(start), ball(stop)
         middle, half = (low + high) / 2, (high - low) / 2
         model = frame.time(middle, half) if i == 0 else frame.parameter(i - 1, middle, half)
-        values[name] = np.array([[model]], dtype=object)
+        coordinates.append(np.array([[model]], dtype=object))
     try:
+        values = rows.piece.place(coordinates, lambda number: frame.number(exact_ball(number)))
         violation = row.value(values, decision[None])[0, 0]
     except (Unchecked, ValueError, ZeroDivisionError):
         return np.inf
@@ -106,8 +108,7 @@ def _require_kept(rows: ExpressionRows, row: StatedRow, x: Array, index: Array, 
     """Raise `Broken` where a row is violated by more than the ``limit`` at one index."""
     violation = evaluate_row(rows, row, x, index)
     if violation > limit:
-        at = ", ".join(f"{name} = {value:.9g}" for name, value in zip(rows.words.indices, index.tolist(), strict=True))
-        raise Broken(f"{row.text!r} is violated by {float(violation):.3g} at {at}")
+        raise Broken(f"{row.text!r} is violated by {float(violation):.3g} at {rows.piece.describe(index)}")
 
 
 def evaluate_row(rows: ExpressionRows, row: StatedRow, x: Array, index: Array) -> arb:
@@ -126,7 +127,10 @@ def coefficients_at(rows: ExpressionRows, row: StatedRow, index: Array, n: int) 
 
 
 def _list_values(rows: ExpressionRows, index: Array) -> Mapping[str, Value]:
-    return {
-        name: np.array([[ball(float(value))]], dtype=object)
-        for name, value in zip(rows.words.indices, index, strict=True)
-    }
+    coordinates = [np.array([[ball(value)]], dtype=object) for value in index.tolist()]
+    return rows.piece.place(coordinates, exact_ball)
+
+
+def exact_ball(number: Fraction) -> arb:
+    """Return a ball with a fraction in it."""
+    return arb(fmpq(number.numerator, number.denominator))

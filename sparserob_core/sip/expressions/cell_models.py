@@ -51,6 +51,13 @@ class CellModels(Operand):
         return CellModels(space, coefficients, np.zeros(value.shape))
 
     @staticmethod
+    def of_fraction(space: TaylorSpace, value: Fraction) -> CellModels:
+        """Return one exact number as a model, whose remainder is the distance from its double."""
+        model = CellModels.constant(space, np.full((1, 1), float(value)))
+        model.remainder += float(abs(Fraction(float(value)) - value)) * OUTWARD
+        return model
+
+    @staticmethod
     def variables(space: TaylorSpace, lower: Array, upper: Array) -> list[CellModels]:
         """Return the coordinates of cells ``[lower, upper]``, ``(k, nu)`` each, as models of one column."""
         middle = lower + (upper - lower) / 2

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, as_bound
 from sparserob_core.sip.convexity import require_convex
+from sparserob_core.sip.expressions.index_sets import Index, Region, number_parts, read_index
 from sparserob_core.sip.expressions.rows import ExpressionRows
 from sparserob_core.sip.expressions.statements import Decisions, StatedRow, Words, parse_cost, parse_rows, read_tables
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
@@ -46,20 +47,20 @@ class StatedDecision:
 @final
 @dataclass(frozen=True, eq=False)
 class StatedFamily:
-    """Rows that hold for every index of a box.
+    """Rows that hold for every index of a set.
 
     Parameters
     ----------
     name : str
         Name of the family.
-    index : mapping from str to (float, float)
-        Interval of every coordinate.
+    index : mapping, or sequence of mappings
+        Interval of every coordinate; or names and a polytope; or a list of these (`ConstraintFamily.from_expressions`).
     rows : sequence of str
         Statements, affine in the decision (`ConstraintFamily.from_expressions`).
     """
 
     name: str
-    index: Mapping[str, Sequence[float]]
+    index: Index
     rows: Sequence[str]
 
 
@@ -167,19 +168,31 @@ class StatedProgram:
         )
 
     @cached_property
-    def parsed(self) -> tuple[tuple[str, ExpressionRows], ...]:
-        """Names and rows of all families."""
-        tables, found = self._words.tables, list[tuple[str, ExpressionRows]]()
+    def regions(self) -> tuple[tuple[Region, ...], ...]:
+        """Index sets of every family."""
+        regions = []
         for i, family in enumerate(self.families):
+            try:
+                regions.append(tuple(read_index(family.index)))
+            except InputError as error:
+                raise error.under("families", i) from None
+        return tuple(regions)
+
+    @cached_property
+    def parsed(self) -> tuple[tuple[str, ExpressionRows], ...]:
+        """Names and rows of all families, one for every piece of their index sets."""
+        tables, named_rows = self._words.tables, list[tuple[str, ExpressionRows]]()
+        for i, (family, regions) in enumerate(zip(self.families, self.regions, strict=True)):
             if family.name in RESERVED:
                 raise InputError(
                     path=f"families.{i}.name", expected="a name that no claim of a check has", got=family.name
                 )
             try:
-                found.append((family.name, ExpressionRows.parse(family.index, family.rows, self.decisions, tables)))
+                parts = ExpressionRows.parse_all(regions, family.rows, self.decisions, tables)
             except InputError as error:
                 raise error.under("families", i) from None
-        return tuple(found)
+            named_rows += zip(number_parts(family.name, len(parts)), parts, strict=True)
+        return tuple(named_rows)
 
     @cached_property
     def _places(self) -> Mapping[int, int]:

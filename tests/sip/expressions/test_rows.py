@@ -10,7 +10,8 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.errors import InputError
-from sparserob_core.sip.expressions.rows import ExpressionRows, read_intervals
+from sparserob_core.sip.expressions.index_sets import read_intervals
+from sparserob_core.sip.expressions.rows import ExpressionRows
 from sparserob_core.sip.expressions.statements import Decisions
 
 NAMES = ("p", "q", "r", "s", "t")
