@@ -9,6 +9,7 @@ from pydantic import Field
 
 from sparserob_core.control.problem.problem import ProblemFactory
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.config.matrices.packed import OrPacked
 from sparserob_core.experiment.config.option_kinds import OneOrMore
 from sparserob_core.experiment.config.problems import Parameters, ParameterSetOptions
 from sparserob_core.options import Options
@@ -16,6 +17,7 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.stated.statement import StatedDecision, StatedFamily, StatedProgram
 
 Bound: TypeAlias = OneOrMore | None
+Table: TypeAlias = Annotated[list[float] | list[list[float]], OrPacked(line=True)]
 
 
 @final
@@ -84,8 +86,9 @@ class ProgramProblem(ProblemFactory, Options):
     families: list[FamilyOptions] = Field(default_factory=list)
     """Rows that hold for every index."""
 
-    tables: dict[str, list[float] | list[list[float]]] = Field(default_factory=dict)
-    """Lists of numbers, or matrices, whose entries the texts may name: ``c[k]``, ``F[i, k]``."""
+    tables: dict[str, Table] = Field(default_factory=dict)
+    """Lists of numbers, or matrices, whose entries the texts may name: ``c[k]``, ``F[i, k]``; or a file relative to the
+    config, ``{file: prices.csv}``, in which one row or one column is a list."""
 
     def build(self) -> SemiInfiniteProgram:
         """Return the program; raises `InputError` that begins with the key at fault."""
