@@ -19,9 +19,8 @@ from typing import final
 import numpy as np
 from flint import arb, arb_mat
 
-from sparserob_core.checker.arithmetic.balls import ball, largest, smallest
+from sparserob_core.checker.arithmetic.balls import ball, largest, rational, smallest
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.program.rows import exact_ball
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.stated.statement import StatedProgram
 from sparserob_core.sip.stated.terms import AffineFunction
@@ -82,12 +81,12 @@ class Lagrangian:
 
     def _add_objective(self, program: StatedProgram) -> None:
         polynomial = program.polynomial
-        self.constant, self.products = exact_ball(polynomial.constant), polynomial.products
+        self.constant, self.products = rational(polynomial.constant), polynomial.products
         for position, value in polynomial.slopes.items():
-            self.slope[position] = exact_ball(value)
+            self.slope[position] = rational(value)
         for (i, j), product in polynomial.products.items():
             for key in ((i, j), (j, i)):
-                self.quadratic[key] = self.quadratic.get(key, ball(0.0)) + exact_ball(product)
+                self.quadratic[key] = self.quadratic.get(key, ball(0.0)) + rational(product)
         for weight, (place, factor) in program.absolutes:
             self.weights[place] = self.weights[place] + ball(weight) * abs(ball(factor))
 

@@ -73,15 +73,27 @@ class Piece:
         placed = {name: values[name] for name in self.names if name not in self.mapped}
         for j, name in enumerate(self.mapped):
             corners = [vertex[j] for vertex in self.simplex]
-            value: Value = 0.0
+            value: Value = number(Fraction(0))
             for i in range(self.shares, 0, -1):
                 value = coordinates[i - 1] * (value + number(corners[i] - corners[i - 1]))
             placed[name] = value + number(corners[0])
         return placed
 
+    def place_exactly(self, index: Array) -> dict[str, Fraction]:
+        """Return one index by name, from the coordinates of the box, without rounding."""
+        return self.place([Fraction(float(value)) for value in index], Fraction)
+
+    def place_columns(self, indices: Array) -> dict[str, Array]:
+        """Return indices ``(k, d)`` of the box by name, ``(k, 1)`` each; none is beyond all vertices by rounding."""
+        columns = self.place([indices[:, [i]] for i in range(self.lower.size)], float)
+        for j, name in enumerate(self.mapped):
+            ends = [float(vertex[j]) for vertex in self.simplex]
+            columns[name] = np.clip(columns[name], min(ends), max(ends))
+        return columns
+
     def locate(self, index: Array) -> dict[str, float]:
         """Return one index by name, from the coordinates of the box."""
-        return {name: float(value) for name, value in self.place(list(index), float).items()}
+        return {name: float(value) for name, value in self.place_exactly(index).items()}
 
     def describe(self, index: Array) -> str:
         """Return one index as text, from the coordinates of the box."""

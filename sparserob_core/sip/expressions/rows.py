@@ -89,7 +89,7 @@ class ExpressionRows:
     @shaped
     def evaluate(self, indices: Float[Array, "k d"]) -> tuple[Float[Array, "k r n"], Float[Array, "k r"]]:
         """Return rows ``G`` and right-hand sides ``h`` of ``G x <= h`` at indices."""
-        values = self._place_columns(indices)
+        values = self.piece.place_columns(indices)
         G = np.zeros((len(indices), len(self.rows), self.words.decisions.n))
         h = np.zeros((len(indices), len(self.rows)))
         for i, row in enumerate(self.rows):
@@ -98,9 +98,6 @@ class ExpressionRows:
             np.add.at(G[:, i].T, form.position, np.broadcast_to(form.coefficient, (len(indices), form.position.size)).T)
             self._require_values(row, indices, np.isfinite(G[:, i]).all(axis=1) & np.isfinite(h[:, i]))
         return G, h
-
-    def _place_columns(self, indices: Array) -> Mapping[str, Array]:
-        return self.piece.place([indices[:, [i]] for i in range(self.dimension)], float)
 
     def _require_values(self, row: StatedRow, indices: Array, has_value: np.ndarray) -> None:
         """Raise `InputError` where a row has no finite value at an index."""
@@ -133,7 +130,7 @@ class ExpressionRows:
     @shaped
     def violations(self, x: Float[Array, " n"], indices: Float[Array, "k d"]) -> Float[Array, "k r"]:
         """Return the violations of the rows at a decision and at indices."""
-        values = self._place_columns(indices)
+        values = self.piece.place_columns(indices)
         columns = [np.broadcast_to(row.value(values, x[None]), (len(indices), 1)) for row in self.rows]
         for row, column in zip(self.rows, columns, strict=True):
             self._require_values(row, indices, np.isfinite(column[:, 0]))
