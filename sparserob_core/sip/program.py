@@ -18,6 +18,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, sealed, shaped
 from sparserob_core.sip.convex_set import Array, Box, as_bound
 from sparserob_core.sip.convexity import require_convex, sparse_matrix
+from sparserob_core.sip.expressions.index_sets import Index, number_parts, read_index
 from sparserob_core.sip.expressions.rows import ExpressionRows
 from sparserob_core.sip.expressions.slopes import BoundedSlopes
 from sparserob_core.sip.expressions.statements import Decisions, read_tables
@@ -284,6 +285,8 @@ class ConstraintFamily:
         proof needs nothing of the kind.
     source : object, optional
         Object from which the family was made. The core never reads it, and returns it to whoever made the family.
+    parts : tuple of ConstraintFamily, default ()
+        Families for which this one stands, such as the pieces of a polytope: a program has them in its place.
     """
 
     name: str
@@ -317,6 +320,7 @@ class ConstraintFamily:
     formulation: Formulation = "reduced"
     believed: str = "encloses or separates"
     source: object = None
+    parts: tuple[ConstraintFamily, ...] = ()
 
     def __post_init__(self) -> None:
         sealed(self)
@@ -325,7 +329,7 @@ class ConstraintFamily:
     def from_expressions(
         name: str,
         *,
-        index: Mapping[str, Sequence[float]],
+        index: Index,
         rows: Sequence[str] | str,
         decision: Mapping[str, int | None],
         tables: Mapping[str, npt.ArrayLike] = MappingProxyType({}),
@@ -336,8 +340,10 @@ class ConstraintFamily:
         ----------
         name : str
             Name of the family.
-        index : mapping from str to (float, float)
-            Interval of every coordinate of the index, by name.
+        index : mapping, or sequence of mappings
+            Interval of every coordinate of the index, by name, ``{"x": (0, 1)}``; or ``{"names": ["x", "y"],
+            "polytope": {"H": H, "h": h}}``, whose polytope may also be a set with finitely many faces; or a list of
+            these, in each of which the rows hold.
         rows : str or sequence of str
             Statements such as ``"sum(a[k] * cos(2*pi*k*w) for k in range(10)) - 1 <= d"``, affine in the decision.
             They know the language of the entries of a system, and also ``>=``, two comparisons in one, ``chebyshev(k,
@@ -350,12 +356,12 @@ class ConstraintFamily:
         Returns
         -------
         ConstraintFamily
-            The family; its ``source`` are the parsed rows.
+            The family; its ``source`` are the parsed rows. A polytope, or a list, has several ``parts``.
 
         Raises
         ------
         InputError
-            If a text is no such statement, or a name, an interval or a table is wrong.
+            If a text is no such statement, or a name, an interval, a polytope or a table is wrong.
 
         Examples
         --------
@@ -367,13 +373,17 @@ class ConstraintFamily:
         >>> result.status, round(result.cost, 6)
         ('certified', 0.045017)
         """
-        return ConstraintFamily.of_rows(
-            name, ExpressionRows.parse(index, rows, Decisions(decision), read_tables(tables))
-        )
+        pieces = ExpressionRows.parse_all(read_index(index), rows, Decisions(decision), read_tables(tables))
+        parts = [
+            ConstraintFamily.of_rows(part_name, piece)
+            for part_name, piece in zip(number_parts(name, len(pieces)), pieces, strict=True)
+        ]
+        return parts[0] if len(parts) == 1 else replace(parts[0], name=name, parts=tuple(parts))
 
     @staticmethod
     def of_rows(name: str, expressions: ExpressionRows) -> ConstraintFamily:
         """Return the family of parsed rows."""
+        piece = expressions.piece
 
         def enclose(x: Array, lower: Array, upper: Array) -> Enclosure:
             return Enclosure(*expressions.enclose(x, lower, upper))
@@ -385,7 +395,8 @@ class ConstraintFamily:
             enclosure=enclose,
             excess=expressions.violations,
             sharpness=EXPRESSED,
-            coordinates=expressions.words.indices,
+            explain=lambda index, row: Unexplained(f"row {row} of {name} at {piece.describe(index)}"),
+            coordinates=piece.labels,
             believed="",
             source=expressions,
         )
@@ -848,10 +859,11 @@ class SemiInfiniteProgram:
         if (lower > upper).any():
             raise InputError("lower: is above upper, so nothing is feasible")
         q = _check_vector("q", 0.0 if self.q is None else self.q, self.n)
-        names = [family.name for family in self.families]
+        families = tuple(part for family in self.families for part in family.parts or (family,))
+        names = [family.name for family in families]
         if len(set(names)) < len(names):
             raise InputError(f"families: names must differ, got {names}")
-        object.__setattr__(self, "families", tuple(self.families))
+        object.__setattr__(self, "families", families)
         constant = _check_vector("constant", self.constant, 1)
         finite = FiniteProgram(
             q=q, weights=weights, lower=lower, upper=upper, G=G, h=h, A=A, b=b, P=P, S=S, constant=float(constant[0])

@@ -96,13 +96,13 @@ def absolute_value() -> float:
     )
 
 
+def monomials(p: Points) -> np.ndarray:
+    y, z = p.T
+    return np.stack([np.ones_like(y), y, z, y * y, y * z, z * z], axis=1)
+
+
 def watson8() -> float:
     """Grids about the points that bind, ever finer."""
-
-    def monomials(p: Points) -> np.ndarray:
-        y, z = p.T
-        return np.stack([np.ones_like(y), y, z, y * y, y * z, z * z], axis=1)
-
     cost, width = np.array([1, 1 / 2, 1 / 2, 1 / 3, 1 / 4, 1 / 3]), 1.0 / 60
     points = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 61)]), axis=-1).reshape(-1, 2)
     offsets = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, 9)]), axis=-1).reshape(-1, 2)
@@ -114,6 +114,53 @@ def watson8() -> float:
         points, width = np.unique(np.concatenate([points, near]), axis=0), width / 4
         points = points[monomials(points) @ x - np.exp((points**2).sum(axis=1)) < 64 * width**2]
     return float(cost @ x)
+
+
+def triangle() -> float:
+    """Cutting planes from the peaks of the error on a grid of weights of the three vertices, each of them zoomed in."""
+    corners = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
+    weights = np.array([(i, j, 120 - i - j) for i in range(121) for j in range(121 - i)]) / 120
+    offsets = np.array([(i, j, -i - j) for i in range(-4, 5) for j in range(-4, 5)]) / 4
+    imposed = weights[::37]
+
+    def target(w: np.ndarray) -> np.ndarray:
+        return np.exp((w @ corners).prod(axis=1)) * np.sin(w @ corners @ [1.0, 2.0])
+
+    for _ in range(40):
+        basis, values = monomials(imposed @ corners), target(imposed)
+        G = np.vstack([np.insert(sign * basis, 6, -1.0, axis=1) for sign in (1.0, -1.0)])
+        x = solve_linear(np.eye(7)[-1], G, np.concatenate([values, -values]))
+
+        def error(w: np.ndarray, a: np.ndarray = x[:-1]) -> np.ndarray:
+            return np.abs(monomials(w @ corners) @ a - target(w))
+
+        best, peak = list[np.ndarray](), 0.0
+        sizes = error(weights)
+        for _ in range(12):
+            place, width = weights[sizes.argmax()], 1.0 / 120
+            sizes[np.abs(weights - place).max(axis=1) < 0.1] = 0.0
+            for _ in range(14):
+                near = np.maximum(place + width * offsets, 0.0)
+                near /= near.sum(axis=1, keepdims=True)
+                place, width = near[error(near).argmax()], width / 3
+            best.append(place)
+            peak = max(peak, float(error(place[None])[0]))
+        if peak <= x[-1] * (1.0 + 1e-8):
+            return float(x[-1])
+        imposed = np.vstack([imposed, best])
+    raise AssertionError("the cutting planes did not converge")
+
+
+def clique() -> float:
+    """Motzkin and Straus (1965), with all sets of vertices looked at."""
+    edges = {frozenset(edge) for edge in ((1, 2), (1, 3), (2, 3), (3, 4), (4, 5), (1, 5))}
+    sizes = [
+        size
+        for size in range(1, 6)
+        for group in combinations(range(1, 6), size)
+        if all(frozenset(pair) in edges for pair in combinations(group, 2))
+    ]
+    return 1.0 - 1.0 / max(sizes)
 
 
 def tangent() -> float:
@@ -174,6 +221,7 @@ VALUES: dict[str, Callable[[], float]] = {
     "band_pass": band_pass,
     "beam_pattern": lambda: 1 / math.cosh(15 * math.acosh(1 / math.cos(math.pi * math.sin(0.15) / 2))),
     "camel": camel,
+    "clique_number": clique,
     "complex_filter": complex_filter,
     "convex_fit": convex_fit,
     "equiripple": low_pass,
@@ -182,6 +230,7 @@ VALUES: dict[str, Callable[[], float]] = {
     "option_moments": option,
     "reciprocal": lambda: 1 / math.cosh(11 * math.acosh(11 / 9)),
     "robust_portfolio": portfolio,
+    "triangle": triangle,
     "watson8": watson8,
 }
 """Values of the configs, by other means."""

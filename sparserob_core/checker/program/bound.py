@@ -11,20 +11,22 @@ negative.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import final
 
 import numpy as np
 from flint import arb, arb_mat
 
-from sparserob_core.checker.arithmetic.balls import ball, largest, smallest
+from sparserob_core.checker.arithmetic.balls import ball, largest, rational, smallest
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.stated.statement import StatedProgram
 from sparserob_core.sip.stated.terms import AffineFunction
 
 MAX_ENTRIES = 300  # in products with each other: twice as many take eight times as long, a minute
+MAX_EXACT = 60  # in products whose sum is 0 along a line: fractions grow, and twice as many take sixteen times as long
 INDEPENDENT = 1e-11  # of the largest entry: a smaller pivot is rounding, and a larger one gives wide balls at worst
 
 
@@ -71,22 +73,20 @@ class Lagrangian:
         self.lower, self.upper = program.bounds
         self.constant, self.slope, self.weights = ball(0.0), [ball(0.0)] * n, [ball(0.0)] * n
         self.quadratic: dict[tuple[int, int], arb] = {}
+        self.products: Mapping[tuple[int, int], Fraction] = {}
         if is_priced:
             self._add_objective(program)
         self.is_diagonal = all(i == j for i, j in self.quadratic)
         self.tangent = [ball(value) for value in (np.zeros(n) if tangent is None else tangent)]
 
     def _add_objective(self, program: StatedProgram) -> None:
-        linear = program.objective.linear
-        self.constant = ball(linear.constant)
-        for position, value in zip(linear.positions.tolist(), linear.coefficients.tolist(), strict=True):
-            self.slope[position] = ball(value)
-        for weight, (i, a), (j, b) in program.products:
-            if weight == 0.0:
-                continue
-            product = ball(weight) * ball(a) * ball(b)
+        polynomial = program.polynomial
+        self.constant, self.products = rational(polynomial.constant), polynomial.products
+        for position, value in polynomial.slopes.items():
+            self.slope[position] = rational(value)
+        for (i, j), product in polynomial.products.items():
             for key in ((i, j), (j, i)):
-                self.quadratic[key] = self.quadratic.get(key, ball(0.0)) + product
+                self.quadratic[key] = self.quadratic.get(key, ball(0.0)) + rational(product)
         for weight, (place, factor) in program.absolutes:
             self.weights[place] = self.weights[place] + ball(weight) * abs(ball(factor))
 
@@ -102,7 +102,8 @@ class Lagrangian:
         table = [[self.quadratic.get((i, j), arb(0)) for j in entries] for i in entries]
         for k, pivot_row in enumerate(table):
             if not pivot_row[k] > 0:
-                raise Unchecked("the products of the objective are not shown to be convex")
+                _require_semidefinite(self.products)
+                return
             for row in table[k + 1 :]:
                 share = row[k] / pivot_row[k]
                 row[k:] = [a - share * b for a, b in zip(row[k:], pivot_row[k:], strict=True)]
@@ -210,6 +211,21 @@ class Lagrangian:
         value = weight * abs(at) + slope * at + curvature * at * at / 2
         changes = [turn * (end - at) for end in ends] if len(ends) == 2 else [-turn * turn / (2 * curvature)]
         return largest([inside, value + smallest([*changes, ball(0.0)])])
+
+
+def _require_semidefinite(products: Mapping[tuple[int, int], Fraction]) -> None:
+    """Raise `Broken` where a sum of products of entries is negative somewhere, by elimination in fractions."""
+    entries = sorted({i for key in products for i in key})
+    if len(entries) > MAX_EXACT:
+        raise Unchecked(f"products of more than {MAX_EXACT} entries, whose sum may be 0, are not shown to be convex")
+    table = [[(1 + (i == j)) * products.get((min(i, j), max(i, j)), Fraction(0)) for j in entries] for i in entries]
+    for k, pivot_row in enumerate(table):
+        pivot = pivot_row[k]
+        if pivot < 0 or (pivot == 0 and any(pivot_row[k:])):
+            raise Broken("the objective is not convex")
+        for row in table[k + 1 :] if pivot else ():
+            share = row[k] / pivot
+            row[k:] = [a - share * b for a, b in zip(row[k:], pivot_row[k:], strict=True)]
 
 
 def _choose_columns(matrix: Array, sizes: Array) -> list[int]:

@@ -15,8 +15,10 @@ from sparserob_core.checker.claims.case import listed, number, shaped
 from sparserob_core.checker.claims.claims import PRECISION, SMALL_COST, SMALL_GAP, judged
 from sparserob_core.checker.outcome import EQUALITY, FIGURES, TOLERANCE, Broken, Clock, Finding, Unchecked
 from sparserob_core.checker.program.bound import Lagrangian, WeightedRow, row_of_term
+from sparserob_core.checker.program.cover import require_cover
 from sparserob_core.checker.program.rows import bound_violation, coefficients_at, evaluate_row
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.index_sets import Region
 from sparserob_core.sip.expressions.rows import ExpressionRows
 from sparserob_core.sip.expressions.statements import StatedRow
 from sparserob_core.sip.stated.statement import StatedProgram
@@ -70,25 +72,43 @@ class ProgramCase:
 def check_program(case: ProgramCase, gap_tolerance: float | None) -> list[Finding]:
     """Return one verdict per claim of the certificate; nothing that the file says is believed."""
     with ctx.workprec(PRECISION):
-        if case.status == "infeasible":
-            return [judged("infeasibility", lambda: _verify_infeasibility(case))]
-        if case.status not in (*CLAIMS, "refuted", "undecided"):
-            return [Finding("status", "fails", f"it is {case.status!r}, which claims nothing")]
-        lower = judged("lower bound", lambda: _verify_lower_bound(case))
-        if case.certificate.get("decision") is None:
-            is_claimed = case.status != "undecided" or case.certificate.get("cost") is not None
-            return [lower, *([Finding("objective", "fails", "it is told of no decision")] if is_claimed else [])]
-        claims = [judged("objective", lambda: _verify_cost(case)), lower]
-        if case.status == "refuted":
-            return [*claims, judged("violation", lambda: _verify_witness(case))]
-        if case.status == "undecided":
-            return claims
-        claims.append(judged("bounds and rows", lambda: _verify_finite_rows(case)))
-        claims += [
-            judged(name, lambda name=name, rows=rows: _verify_family(case, name, rows))  # type: ignore[misc]
-            for name, rows in case.program.parsed
+        covers = [
+            judged(f"polytope of {family.name}", lambda region=region: _verify_cover(region))  # type: ignore[misc]
+            for family, regions in zip(case.program.families, case.program.regions, strict=True)
+            for region in regions
+            if region.coupled
         ]
-        return [*claims, judged("status", lambda: _verify_status(case, gap_tolerance, claims))]
+        if any(cover.verdict != "holds" for cover in covers):
+            return covers  # no index is then known to be one, and no part of the set to be all of it
+        return [*covers, *_check_claims(case, gap_tolerance)]
+
+
+def _check_claims(case: ProgramCase, gap_tolerance: float | None) -> list[Finding]:
+    """Return one verdict per claim about a program whose index sets are covered by their pieces."""
+    if case.status == "infeasible":
+        return [judged("infeasibility", lambda: _verify_infeasibility(case))]
+    if case.status not in (*CLAIMS, "refuted", "undecided"):
+        return [Finding("status", "fails", f"it is {case.status!r}, which claims nothing")]
+    lower = judged("lower bound", lambda: _verify_lower_bound(case))
+    if case.certificate.get("decision") is None:
+        is_claimed = case.status != "undecided" or case.certificate.get("cost") is not None
+        return [lower, *([Finding("objective", "fails", "it is told of no decision")] if is_claimed else [])]
+    claims = [judged("objective", lambda: _verify_cost(case)), lower]
+    if case.status == "refuted":
+        return [*claims, judged("violation", lambda: _verify_witness(case))]
+    if case.status == "undecided":
+        return claims
+    claims.append(judged("bounds and rows", lambda: _verify_finite_rows(case)))
+    claims += [
+        judged(name, lambda name=name, rows=rows: _verify_family(case, name, rows))  # type: ignore[misc]
+        for name, rows in case.program.parsed
+    ]
+    return [*claims, judged("status", lambda: _verify_status(case, gap_tolerance, claims))]
+
+
+def _verify_cover(region: Region) -> str:
+    """Show that the simplices of a polytope are all of it."""
+    return f"{require_cover(region)} simplices cover it"
 
 
 def _evaluate_term(term: AffineFunction, x: Array) -> tuple[arb, float]:
@@ -229,7 +249,7 @@ def _verify_witness(case: ProgramCase) -> str:
     violation = evaluate_row(family, row, case.decision, index)
     if not violation > TOLERANCE:
         raise Broken(f"the witness violates its row by {float(violation):.3g}")
-    return f"{row.text!r} is violated by {below(violation):.3g} at {index.tolist()}"
+    return f"{row.text!r} is violated by {below(violation):.3g} at {family.piece.describe(index)}"
 
 
 def _verify_status(case: ProgramCase, gap_tolerance: float | None, claims: list[Finding]) -> str:

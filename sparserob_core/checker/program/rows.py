@@ -12,8 +12,7 @@ from itertools import count
 import numpy as np
 from flint import arb
 
-from sparserob_core.checker.arithmetic.balls import above, ball
-from sparserob_core.checker.arithmetic.bernstein import highest
+from sparserob_core.checker.arithmetic.balls import ball, rational
 from sparserob_core.checker.arithmetic.models import Frame, Model
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
@@ -46,15 +45,14 @@ def bound_violation(rows: ExpressionRows, row: StatedRow, x: Array, limit: float
             raise Unchecked(f"more than {MAX_CELLS} cells of {row.text!r} are needed")
         clock.check()
         lower, upper, sharpened = work.pop()
-        bound = _bound_cell(rows, row, frame, decision, lower, upper)
+        bound, steepness = _bound_cell(rows, row, frame, decision, lower, upper)
         if bound <= (SHARP * limit if sharpened < SHARPENED else limit):
             worst = max(worst, bound)
             continue
         sharpened += bound <= limit
         middle = lower + (upper - lower) / 2
         _require_kept(rows, row, x, middle, limit)
-        shares = (upper - lower) / np.maximum(rows.upper - rows.lower, np.finfo(float).tiny)
-        axis = int(shares.argmax())
+        axis = int(steepness.argmax())
         if not lower[axis] < middle[axis] < upper[axis]:
             raise Unchecked(f"no cell around the index {middle.tolist()} is short enough for {row.text!r}")
         low, high = lower.copy(), upper.copy()
@@ -70,44 +68,32 @@ def _make_frame(dimension: int) -> Frame:
 
 def _bound_cell(
     rows: ExpressionRows, row: StatedRow, frame: Frame, decision: np.ndarray, lower: Array, upper: Array
-) -> float:
-    """Return an upper bound of the violation over one cell; infinite where the row has no enclosure there."""
-    values: dict[str, Value] = {}
-    for i, name in enumerate(rows.words.indices):
-        low, high = ball(float(lower[i])), ball(float(upper[i]))
+) -> tuple[float, Array]:
+    """Return an upper bound of the violation over one cell, infinite where the row has no enclosure there, and by how
+    much it changes across the cell along each coordinate: by its part of the side of the box, where that is unknown."""
+    coordinates: list[Value] = []
+    for i, (start, stop) in enumerate(zip(lower.tolist(), upper.tolist(), strict=True)):
+        low, high = ball(start), ball(stop)
         middle, half = (low + high) / 2, (high - low) / 2
         model = frame.time(middle, half) if i == 0 else frame.parameter(i - 1, middle, half)
-        values[name] = np.array([[model]], dtype=object)
+        coordinates.append(np.array([[model]], dtype=object))
+    shares = (upper - lower) / np.maximum(rows.upper - rows.lower, np.finfo(float).tiny)
     try:
+        values = rows.piece.place(coordinates, lambda number: frame.number(rational(number)))
         violation = row.value(values, decision[None])[0, 0]
     except (Unchecked, ValueError, ZeroDivisionError):
-        return np.inf
-    coefficients, error = _separate_errors(frame, violation)
-    if not np.isfinite(coefficients).all() or not np.isfinite(error):
-        return np.inf
-    return float(highest(coefficients[None], [True] * (lower.size), np.array([error]), 0.0)[0])
-
-
-def _separate_errors(frame: Frame, value: Value) -> tuple[Array, float]:
-    """Return the middles of the coefficients of a model, and a bound of what they leave out."""
-    variables, degree = frame.monomials.count, frame.monomials.degree
-    coefficients = np.zeros((frame.order + 1, *([degree + 1] * variables)))
-    model = value if isinstance(value, Model) else frame.number(arb(value))
-    error = arb(0)
-    for exponents, part in zip(frame.monomials.exponents, model.parts, strict=True):
-        for power, coefficient in enumerate([] if part is None else part.coeffs()):
-            middle = float(coefficient.mid())
-            coefficients[(power, *exponents)] = middle
-            error = error + abs(coefficient - middle)
-    return coefficients, above(error)
+        return np.inf, shares
+    model = violation if isinstance(violation, Model) else frame.number(arb(violation))
+    bound, steepness = model.highest(), model.steepness()
+    is_known = np.isfinite(bound) and (steepness[shares > 0.0] > 0.0).any()
+    return bound, np.where(shares > 0.0, steepness, -1.0) if is_known else shares
 
 
 def _require_kept(rows: ExpressionRows, row: StatedRow, x: Array, index: Array, limit: float) -> None:
     """Raise `Broken` where a row is violated by more than the ``limit`` at one index."""
     violation = evaluate_row(rows, row, x, index)
     if violation > limit:
-        at = ", ".join(f"{name} = {value:.9g}" for name, value in zip(rows.words.indices, index.tolist(), strict=True))
-        raise Broken(f"{row.text!r} is violated by {float(violation):.3g} at {at}")
+        raise Broken(f"{row.text!r} is violated by {float(violation):.3g} at {rows.piece.describe(index)}")
 
 
 def evaluate_row(rows: ExpressionRows, row: StatedRow, x: Array, index: Array) -> arb:
@@ -126,7 +112,5 @@ def coefficients_at(rows: ExpressionRows, row: StatedRow, index: Array, n: int) 
 
 
 def _list_values(rows: ExpressionRows, index: Array) -> Mapping[str, Value]:
-    return {
-        name: np.array([[ball(float(value))]], dtype=object)
-        for name, value in zip(rows.words.indices, index, strict=True)
-    }
+    placed = rows.piece.place_exactly(index)
+    return {name: np.array([[rational(value)]], dtype=object) for name, value in placed.items()}

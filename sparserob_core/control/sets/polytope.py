@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import cached_property
-from itertools import combinations
-from math import comb
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,12 +13,10 @@ from sparserob_core.brief import noun
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, dense, sealed, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound, continued_by_corners, vertex_excess
+from sparserob_core.sip.expressions.triangulation import find_vertices
 
 _VERTEX_DIMENSIONS = 6
 _VERTEX_ROWS = 200
-_MEETINGS = 20_000  # meetings of rows that are tried as vertices of a set without an interior: a second or two
-_REGULAR = 1e-12  # determinant of unit rows from which on their meeting is known to a thousandth
-_VIOLATED = 1e-9  # relative violation of a row by a meeting, above which fractions are not needed to exclude it
 _SWEEPS = 12
 _ORDINARY = 10  # binary orders of magnitude of the scale factors within which rows and columns are not scaled
 _TOGETHER = 64  # linear programs that are solved as one
@@ -205,24 +199,8 @@ class Polytope(ConvexSet):
         A vertex is a point at which ``d`` rows meet and which no row excludes. The value is ``None`` where there are
         too many meetings, or where the set is empty up to rounding.
         """
-        (rows, d), norms = self.H.shape, np.linalg.norm(self.H, axis=1)
-        if comb(rows, d) > _MEETINGS:
-            return None
-        choices = np.array(list(combinations(range(rows), d)))
-        normals, ends = (self.H / norms[:, None])[choices], (self.h / norms)[choices]
-        is_regular = np.abs(np.linalg.det(normals)) > _REGULAR
-        points = np.linalg.solve(normals[is_regular], ends[is_regular][..., None])[..., 0]
-        is_outside = points @ self.H.T - self.h > _VIOLATED * (np.abs(points) @ np.abs(self.H).T + np.abs(self.h))
-        candidates = np.concatenate([choices[is_regular][~is_outside.any(axis=1)], choices[~is_regular]])
-        H, h = ([[Fraction(float(x)) for x in row] for row in array] for array in (self.H, self.h[:, None]))
-        meetings = {_intersect_hyperplanes([H[i] for i in choice], [h[i][0] for i in choice]) for choice in candidates}
-        corners = [
-            x
-            for x in meetings
-            if x is not None
-            and all(sum(a * b for a, b in zip(row, x, strict=True)) <= end[0] for row, end in zip(H, h, strict=True))
-        ]
-        return np.array([[float(a) for a in x] for x in sorted(corners)]) if corners else None
+        corners = find_vertices(self.H, self.h)
+        return np.array([[float(a) for a in x] for x in corners]) if corners else None
 
     @shaped
     def _polish_vertices(self, points: Float[Array, "v d"], facets: list[list[int]]) -> Float[Array, "u d"]:
@@ -417,26 +395,3 @@ class Polytope(ConvexSet):
                 max(residual, float(np.abs(batch - y @ H).sum(axis=1).max())),
             )
         return 2.0 * abs(highest) / (1.0 - residual) if residual < 0.5 else np.inf
-
-
-def _intersect_hyperplanes(rows: Sequence[Sequence[Fraction]], ends: Sequence[Fraction]) -> tuple[Fraction, ...] | None:
-    """Return the point at which ``d`` hyperplanes meet, by Gauss-Jordan elimination; ``None`` where it is not unique.
-
-    Parameters
-    ----------
-    rows : d sequences of d fractions
-        The normals of the hyperplanes.
-    ends : sequence of d fractions
-        The right-hand sides.
-    """
-    augmented = [[*row, end] for row, end in zip(rows, ends, strict=True)]
-    for i in range(len(augmented)):
-        pivot = next((k for k in range(i, len(augmented)) if augmented[k][i]), None)
-        if pivot is None:
-            return None
-        augmented[i], augmented[pivot] = augmented[pivot], augmented[i]
-        augmented[i] = [x / augmented[i][i] for x in augmented[i]]
-        for k, row in enumerate(augmented):
-            if k != i and row[i]:
-                augmented[k] = [a - row[i] * b for a, b in zip(row, augmented[i], strict=True)]
-    return tuple(row[-1] for row in augmented)

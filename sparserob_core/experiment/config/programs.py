@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Annotated, TypeAlias, final
+from collections.abc import Mapping
+from typing import Annotated, Any, TypeAlias, final
 
 from pydantic import Field
 
 from sparserob_core.control.problem.problem import ProblemFactory
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.config.matrices.packed import OrPacked
 from sparserob_core.experiment.config.option_kinds import OneOrMore
-from sparserob_core.experiment.config.problems import Interval
+from sparserob_core.experiment.config.problems import Parameters, ParameterSetOptions
 from sparserob_core.options import Options
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.stated.statement import StatedDecision, StatedFamily, StatedProgram
 
 Bound: TypeAlias = OneOrMore | None
+Table: TypeAlias = Annotated[list[float] | list[list[float]], OrPacked(line=True)]
 
 
 @final
@@ -42,18 +46,27 @@ class FamilyOptions(Options):
     name: str = Field(min_length=1)
     """Name of the family, in tables and messages."""
 
-    index: dict[str, Interval] | Annotated[list[dict[str, Interval]], Field(min_length=1)]
-    """Interval ``[lower, upper]`` of every coordinate of the index, by name; or a list of such boxes, in each of which
-    the rows hold."""
+    index: Parameters | Annotated[list[Parameters], Field(min_length=1)]
+    """Interval ``[lower, upper]`` of every coordinate of the index, by name; or names and a polytope, as ``{names:
+    [x, y], polytope: {H: ..., h: ...}}``; or a list of such sets, in each of which the rows hold."""
 
     rows: Annotated[list[str], Field(min_length=1)]
     """Rows such as ``sum(a[k]*cos(k*w) for k in range(9)) <= d``: affine in the decision, arithmetic in the index."""
 
-    def stated(self) -> list[StatedFamily]:
-        """Return one family for every box of the index."""
-        if not isinstance(self.index, list):
-            return [StatedFamily(self.name, self.index, self.rows)]
-        return [StatedFamily(f"{self.name} {i + 1}", box, self.rows) for i, box in enumerate(self.index)]
+    def stated(self) -> StatedFamily:
+        """Return the family as the core states it."""
+        is_union = isinstance(self.index, list)
+        parts = self.index if isinstance(self.index, list) else [self.index]
+        keys = [f"index.{i}" if is_union else "index" for i in range(len(parts))]
+        sets = [_state_index_set(part, key) for part, key in zip(parts, keys, strict=True)]
+        return StatedFamily(self.name, sets if is_union else sets[0], self.rows)
+
+
+def _state_index_set(index: Parameters, key: str) -> Mapping[str, Any]:
+    """Return an index set as the core states it; raise `InputError` that begins with the key at fault."""
+    if isinstance(index, ParameterSetOptions):
+        return {"names": index.names, "polytope": index.build(key, len(index.names))}
+    return index
 
 
 @final
@@ -73,8 +86,9 @@ class ProgramProblem(ProblemFactory, Options):
     families: list[FamilyOptions] = Field(default_factory=list)
     """Rows that hold for every index."""
 
-    tables: dict[str, list[float] | list[list[float]]] = Field(default_factory=dict)
-    """Lists of numbers, or matrices, whose entries the texts may name: ``c[k]``, ``F[i, k]``."""
+    tables: dict[str, Table] = Field(default_factory=dict)
+    """Lists of numbers, or matrices, whose entries the texts may name: ``c[k]``, ``F[i, k]``; or a file relative to the
+    config, ``{file: prices.csv}``, in which one row or one column is a list."""
 
     def build(self) -> SemiInfiniteProgram:
         """Return the program; raises `InputError` that begins with the key at fault."""
@@ -85,7 +99,16 @@ class ProgramProblem(ProblemFactory, Options):
         return StatedProgram(
             {name: entry.stated() for name, entry in self.decision.items()},
             str(self.minimise),
-            [family for entry in self.families for family in entry.stated()],
+            self._state_families(),
             self.rows,
             self.tables,
         )
+
+    def _state_families(self) -> list[StatedFamily]:
+        families = []
+        for i, entry in enumerate(self.families):
+            try:
+                families.append(entry.stated())
+            except InputError as error:
+                raise error.under("families", i) from None
+        return families

@@ -23,6 +23,7 @@ Series: TypeAlias = "tuple[list[Array], Array]"
 """Coefficients ``f_0, ..., f_n`` at the constants of models, and bounds of ``|f_{n+1}|`` on their values."""
 MAX_POWER = 64  # the largest exponent for which a power is multiplied out; ten times more take as many products
 MAX_EXPONENT = 700.0  # of the exponential: beyond it doubles overflow
+NEGATIVE = 1e-12  # of values near 1: what rounding may leave below 0; ten times less loses differences of such values
 TANGENT_RADII = np.pi / 4 * (1.0 + 0.05 * np.arange(19))  # circles for Cauchy's bound, below the pole at pi/2
 ROUNDED = 1e-13  # of a Bernstein form: rounding of sums of some hundred products and of halvings, which it exceeds
 HALVINGS = 24  # of a cell for its polynomial: with half of them a peak is cut into cells that are expanded anew
@@ -49,6 +50,13 @@ class CellModels(Operand):
         coefficients = np.zeros((*value.shape, space.size))
         coefficients[..., 0] = value
         return CellModels(space, coefficients, np.zeros(value.shape))
+
+    @staticmethod
+    def of_fraction(space: TaylorSpace, value: Fraction) -> CellModels:
+        """Return one exact number as a model, whose remainder is the distance from its double."""
+        model = CellModels.constant(space, np.full((1, 1), float(value)))
+        model.remainder += float(abs(Fraction(float(value)) - value)) * OUTWARD
+        return model
 
     @staticmethod
     def variables(space: TaylorSpace, lower: Array, upper: Array) -> list[CellModels]:
@@ -228,7 +236,9 @@ def _raise_to_power(left: Any, right: Any) -> CellModels:
 
 
 def _raise_to_number(model: CellModels, power: float) -> CellModels:
-    if not power.is_integer() or abs(power) > MAX_POWER:
+    if not power.is_integer():
+        return _raise_to_fraction(model, power)
+    if abs(power) > MAX_POWER:
         return model.compose(lambda *domain: _power(power, *domain))
     base, count = (model, int(power)) if power >= 0 else (model.compose(_reciprocal), int(-power))
     result = model._constant(np.ones((1, 1)))
@@ -270,6 +280,30 @@ def _power(power: float, degree: int, centre: Array, low: Array, high: Array) ->
     return [binomials[k] * centre ** (power - k) for k in range(degree + 1)], abs(binomials[-1]) * steepest
 
 
+def _raise_to_fraction(model: CellModels, power: float) -> CellModels:
+    """Return a power that is no whole number. Where values reach down to 0, a positive power lies between 0 and its
+    chord to the largest value, or beyond it: it differs from the chord by at most its largest distance, to one side.
+
+    Values below 0 by rounding, `NEGATIVE`, count as 0.
+    """
+    result = model.compose(lambda *domain: _power(power, *domain))
+    high = model.bounds()[1]
+    touches = np.isinf(result.remainder) & (high > 0.0) & np.isfinite(high) & np.isfinite(model.remainder)
+    if power <= 0.0 or not touches.any():
+        return result
+    coefficients, remainder, top = model.coefficients[touches], model.remainder[touches], high[touches]
+    below = np.maximum(bound_polynomials(model.space, -coefficients, remainder, 0.0)[0], 0.0)
+    slope, share = top ** (power - 1.0), power ** (1.0 / (1.0 - power))  # where the power is furthest from its chord
+    half = abs(share**power - share) / 2 * top**power * OUTWARD
+    chord = slope[:, None] * coefficients
+    chord[:, 0] += half if power < 1.0 else -half
+    error = slope * (remainder + below) + half + rounding(16) * (np.abs(chord).sum(axis=1) + top**power)
+    is_known = below <= np.maximum(NEGATIVE, NEGATIVE * top)
+    result.coefficients[touches] = np.where(is_known[:, None], chord, 0.0)
+    result.remainder[touches] = np.where(is_known & np.isfinite(error), error * OUTWARD, np.inf)
+    return result
+
+
 def _tanh(degree: int, centre: Array, low: Array, high: Array) -> Series:
     terms = [np.tanh(centre)]
     for k in range(degree):
@@ -305,7 +339,7 @@ CellModels.operations = {
     np.cos: lambda model: model.compose(_wave(1)),
     np.tan: lambda model: _divide(model.compose(_wave(0)), model.compose(_wave(1))),
     np.log: lambda model: model.compose(_log),
-    np.sqrt: lambda model: model.compose(lambda *domain: _power(0.5, *domain)),
+    np.sqrt: lambda model: _raise_to_fraction(model, 0.5),
     np.tanh: lambda model: model.compose(_tanh),
 }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import final
 
 import numpy as np
@@ -12,6 +13,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import Array, Float, shaped
 from sparserob_core.sip.expressions.cell_models import CellModels, bound_polynomials
 from sparserob_core.sip.expressions.forms import Numbers
+from sparserob_core.sip.expressions.index_sets import Piece, Region
 from sparserob_core.sip.expressions.statements import Decisions, StatedRow, Tables, Words, parse_rows
 from sparserob_core.sip.expressions.taylor import TaylorSpace, taylor_space
 
@@ -32,14 +34,13 @@ class ExpressionRows:
         The names.
     rows : tuple of StatedRow
         The rows, each ``form(index) <= 0``.
-    lower, upper : array (d,)
-        Corners of the index set.
+    piece : Piece
+        The index set, or a part of it. An index is given by its coordinates in the box of the piece.
     """
 
     words: Words
     rows: tuple[StatedRow, ...]
-    lower: Array
-    upper: Array
+    piece: Piece
 
     @staticmethod
     def parse(
@@ -48,16 +49,37 @@ class ExpressionRows:
         decision: Decisions,
         tables: Tables,
     ) -> ExpressionRows:
-        """Return the rows that texts state; raise `InputError`, with its key, for a text that is none."""
-        lower, upper = read_intervals(index)
-        words = Words(decision, tuple(index), tables)
+        """Return the rows that texts state for every index of a box; raise `InputError`, with its key, for a text that
+        is no such statement."""
+        return ExpressionRows.parse_all([Region.of_intervals(index)], rows, decision, tables)[0]
+
+    @staticmethod
+    def parse_all(
+        regions: Sequence[Region], rows: Sequence[str] | str, decision: Decisions, tables: Tables
+    ) -> list[ExpressionRows]:
+        """Return the rows that texts state, for every piece of index sets with the same coordinates; raise
+        `InputError`, with its key, for a text that is no such statement."""
+        words = Words(decision, regions[0].names, tables)
         texts: object = [rows] if isinstance(rows, str) else rows
         if not isinstance(texts, Sequence) or not texts or not all(isinstance(text, str) for text in texts):
             raise InputError(path="rows", expected="at least one row, as text", got=repr(rows))
-        parsed = [row for text in texts for row in parse_rows(text, words)]
-        found = ExpressionRows(words, tuple(parsed), lower, upper)
-        found.evaluate((lower + (upper - lower) / 2)[None])  # whatever cannot be evaluated is told at once
-        return found
+        parsed = tuple(row for text in texts for row in parse_rows(text, words))
+        parts = [ExpressionRows(words, parsed, piece) for region in regions for piece in region.pieces]
+        for part in parts:
+            part.evaluate(
+                (part.lower + (part.upper - part.lower) / 2)[None]
+            )  # what cannot be evaluated is told at once
+        return parts
+
+    @property
+    def lower(self) -> Array:
+        """Lower corner of the box of the piece."""
+        return self.piece.lower
+
+    @property
+    def upper(self) -> Array:
+        """Upper corner of the box of the piece."""
+        return self.piece.upper
 
     @property
     def dimension(self) -> int:
@@ -67,7 +89,7 @@ class ExpressionRows:
     @shaped
     def evaluate(self, indices: Float[Array, "k d"]) -> tuple[Float[Array, "k r n"], Float[Array, "k r"]]:
         """Return rows ``G`` and right-hand sides ``h`` of ``G x <= h`` at indices."""
-        values = {name: indices[:, [i]] for i, name in enumerate(self.words.indices)}
+        values = self.piece.place_columns(indices)
         G = np.zeros((len(indices), len(self.rows), self.words.decisions.n))
         h = np.zeros((len(indices), len(self.rows)))
         for i, row in enumerate(self.rows):
@@ -80,8 +102,7 @@ class ExpressionRows:
     def _require_values(self, row: StatedRow, indices: Array, has_value: np.ndarray) -> None:
         """Raise `InputError` where a row has no finite value at an index."""
         if not has_value.all():
-            index = indices[int(np.argmin(has_value))].tolist()
-            at = ", ".join(f"{name} = {value:g}" for name, value in zip(self.words.indices, index, strict=True))
+            at = self.piece.describe(indices[int(np.argmin(has_value))])
             raise InputError(f"row {row.text!r}: it has no finite value at {at}")
 
     @shaped
@@ -109,7 +130,7 @@ class ExpressionRows:
     @shaped
     def violations(self, x: Float[Array, " n"], indices: Float[Array, "k d"]) -> Float[Array, "k r"]:
         """Return the violations of the rows at a decision and at indices."""
-        values = {name: indices[:, [i]] for i, name in enumerate(self.words.indices)}
+        values = self.piece.place_columns(indices)
         columns = [np.broadcast_to(row.value(values, x[None]), (len(indices), 1)) for row in self.rows]
         for row, column in zip(self.rows, columns, strict=True):
             self._require_values(row, indices, np.isfinite(column[:, 0]))
@@ -119,20 +140,4 @@ class ExpressionRows:
         return value if isinstance(value, CellModels) else CellModels.constant(space, np.asarray(value, dtype=float))
 
     def _variables(self, space: TaylorSpace, lower: Array, upper: Array) -> Mapping[str, CellModels]:
-        return dict(zip(self.words.indices, CellModels.variables(space, lower, upper), strict=True))
-
-
-def read_intervals(index: Mapping[str, Sequence[float]]) -> tuple[Array, Array]:
-    """Return the ends of the intervals of an index; raise `InputError` with the name of one that is none."""
-    given: object = index
-    if not isinstance(given, Mapping) or not given:
-        raise InputError(path="index", expected="at least one coordinate with its interval", got=repr(index))
-    for name, interval in index.items():
-        try:
-            ends = np.asarray(interval, dtype=float)
-        except (TypeError, ValueError):
-            ends = np.zeros(0)
-        if ends.shape != (2,) or not np.isfinite(ends).all() or ends[0] > ends[1]:
-            raise InputError(path=f"index.{name}", expected="an interval [lower, upper]", got=repr(interval))
-    table = np.array([[float(end) for end in interval] for interval in index.values()])
-    return table[:, 0].copy(), table[:, 1].copy()
+        return self.piece.place(CellModels.variables(space, lower, upper), partial(CellModels.of_fraction, space))

@@ -461,6 +461,44 @@ def _solve_least_norm(blocks: list[Array], target: Array) -> list[Array] | None:
     return [change[stop - block.shape[1] : stop] for block, stop in zip(blocks, ends, strict=True)]
 
 
+def balance_rows(rows: Array, equalities: Array, cost: Array) -> tuple[Array, Array, float] | None:
+    """Return positive multipliers ``(r,)`` of rows, any of equalities ``(e,)``, and a factor of the cost that is not
+    negative, with which the sum of all is 0.
+
+    They exist where the rows bound the entries of cheap decisions (Stiemke 1915). The multipliers are about 1. ``None``
+    stands for rows without such a sum.
+
+    Parameters
+    ----------
+    rows : array (r, n)
+        The rows.
+    equalities : array (e, n)
+        The equalities.
+    cost : array (n,)
+        Slopes of the cost; zeros where it does not count.
+    """
+    from scipy.optimize import linprog
+
+    (count, n), free = rows.shape, len(equalities)
+    solution = linprog(
+        np.concatenate([np.zeros(count + free + 1), [-1.0]]),
+        A_ub=np.vstack(
+            [
+                np.hstack([-np.eye(count), np.zeros((count, free + 1)), np.ones((count, 1))]),
+                np.concatenate([np.ones(count), np.zeros(free + 2)])[None],
+            ]
+        ),
+        b_ub=np.concatenate([np.zeros(count), [float(count)]]),
+        A_eq=np.hstack([rows.T, equalities.T, cost[:, None], np.zeros((n, 1))]),
+        b_eq=np.zeros(n),
+        bounds=[(0.0, None)] * count + [(None, None)] * free + [(0.0, None), (0.0, 1.0)],
+        method="highs",
+    )
+    if solution.status != 0 or not solution.x[-1] > 0.0:
+        return None
+    return solution.x[:count], solution.x[count:-2], float(solution.x[-2])
+
+
 @shaped
 def vertex_multipliers(
     program: FiniteProgram, x: Float[Array, " n"], y: Float[Array, " r"], mu: Float[Array, " e"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import cached_property
 from typing import TypeAlias, final
 
@@ -13,15 +14,17 @@ import numpy.typing as npt
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, as_bound
 from sparserob_core.sip.convexity import require_convex
+from sparserob_core.sip.expressions.index_sets import Index, Region, number_parts, read_index
 from sparserob_core.sip.expressions.rows import ExpressionRows
 from sparserob_core.sip.expressions.statements import Decisions, StatedRow, Words, parse_cost, parse_rows, read_tables
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
-from sparserob_core.sip.stated.terms import AffineFunction, StatedObjective
+from sparserob_core.sip.stated.terms import AffineFunction, Polynomial, StatedObjective
 
 RESERVED = ("config", "objective", "lower bound", "bounds and rows", "infeasibility", "violation", "status")
 """Names of claims about a program, which no family may have."""
 Multiple: TypeAlias = tuple[int, float]
 """An entry of the decision, and the factor before it."""
+MAX_PAIRS = 300_000  # of entries, where products are multiplied out in fractions: ten times as many take a minute
 MAX_ENTRIES = 100_000  # of a decision with its residuals: ten times as many take a matrix of gigabytes
 
 
@@ -46,20 +49,20 @@ class StatedDecision:
 @final
 @dataclass(frozen=True, eq=False)
 class StatedFamily:
-    """Rows that hold for every index of a box.
+    """Rows that hold for every index of a set.
 
     Parameters
     ----------
     name : str
         Name of the family.
-    index : mapping from str to (float, float)
-        Interval of every coordinate.
+    index : mapping, or sequence of mappings
+        Interval of every coordinate; or names and a polytope; or a list of these (`ConstraintFamily.from_expressions`).
     rows : sequence of str
         Statements, affine in the decision (`ConstraintFamily.from_expressions`).
     """
 
     name: str
-    index: Mapping[str, Sequence[float]]
+    index: Index
     rows: Sequence[str]
 
 
@@ -110,18 +113,25 @@ class StatedProgram:
     @cached_property
     def residuals(self) -> tuple[AffineFunction, ...]:
         """Affine functions of which the objective takes squares or absolute values, and that are more than one entry:
-        each is a further entry of the decision, so that no condition is squared."""
-        objective = self.objective
-        terms = [term for _, left, right in objective.products for term in (left, right)]
-        terms += [inner for _, inner in objective.absolutes]
-        distinct = {id(term): term for term in terms if not _is_entry(term)}
-        if self._words.decisions.n > MAX_ENTRIES:
-            raise InputError(
-                path="decision", expected=f"at most {MAX_ENTRIES} entries", got=f"{self._words.decisions.n}"
-            )
-        if self._words.decisions.n + len(distinct) > MAX_ENTRIES:
-            raise InputError(path="minimise", expected=f"at most {MAX_ENTRIES} terms", got=f"{len(distinct)}")
-        return tuple(distinct.values())
+        each is a further entry of the decision, so that no condition is squared.
+
+        Where products are convex only together, such as ``(x + y)*(x - y) + 2*y^2``, they are multiplied out instead.
+        """
+        objective, n = self.objective, self._words.decisions.n
+        if n > MAX_ENTRIES:
+            raise InputError(path="decision", expected=f"at most {MAX_ENTRIES} entries", got=f"{n}")
+        inner = [term for _, term in objective.absolutes]
+        every = _list_distinct([term for _, left, right in objective.products for term in (left, right)] + inner)
+        if n + len(every) > MAX_ENTRIES:
+            raise InputError(path="minimise", expected=f"at most {MAX_ENTRIES} terms", got=f"{len(every)}")
+        if objective.is_sum_of_squares or objective.count_pairs() > MAX_PAIRS:
+            return every
+        polynomial = objective.expand(_number_terms(every, n))
+        try:
+            require_convex("minimise", _build_quadratic(polynomial.products, n + len(every)), n + len(every))
+        except InputError:
+            return _list_distinct(inner)
+        return every
 
     @cached_property
     def finite_rows(self) -> tuple[StatedRow, ...]:
@@ -167,32 +177,40 @@ class StatedProgram:
         )
 
     @cached_property
-    def parsed(self) -> tuple[tuple[str, ExpressionRows], ...]:
-        """Names and rows of all families."""
-        tables, found = self._words.tables, list[tuple[str, ExpressionRows]]()
+    def regions(self) -> tuple[tuple[Region, ...], ...]:
+        """Index sets of every family."""
+        regions = []
         for i, family in enumerate(self.families):
+            try:
+                regions.append(tuple(read_index(family.index)))
+            except InputError as error:
+                raise error.under("families", i) from None
+        return tuple(regions)
+
+    @cached_property
+    def parsed(self) -> tuple[tuple[str, ExpressionRows], ...]:
+        """Names and rows of all families, one for every piece of their index sets."""
+        tables, named_rows = self._words.tables, list[tuple[str, ExpressionRows]]()
+        for i, (family, regions) in enumerate(zip(self.families, self.regions, strict=True)):
             if family.name in RESERVED:
                 raise InputError(
                     path=f"families.{i}.name", expected="a name that no claim of a check has", got=family.name
                 )
             try:
-                found.append((family.name, ExpressionRows.parse(family.index, family.rows, self.decisions, tables)))
+                parts = ExpressionRows.parse_all(regions, family.rows, self.decisions, tables)
             except InputError as error:
                 raise error.under("families", i) from None
-        return tuple(found)
+            named_rows += zip(number_parts(family.name, len(parts)), parts, strict=True)
+        return tuple(named_rows)
 
     @cached_property
     def _places(self) -> Mapping[int, int]:
-        first = self.decisions.n - len(self.residuals)
-        return {id(term): first + k for k, term in enumerate(self.residuals)}
+        return _number_terms(self.residuals, self._words.decisions.n)
 
-    @property
-    def products(self) -> list[tuple[float, Multiple, Multiple]]:
-        """Products of the objective: weights, and the multiples of entries of the decision that are multiplied."""
-        return [
-            (weight, _locate(left, self._places), _locate(right, self._places))
-            for weight, left, right in self.objective.products
-        ]
+    @cached_property
+    def polynomial(self) -> Polynomial:
+        """The objective in the entries of the decision, but for its absolute values."""
+        return self.objective.expand(self._places)
 
     @property
     def absolutes(self) -> list[tuple[float, Multiple]]:
@@ -206,12 +224,10 @@ class StatedProgram:
 
     def build(self) -> SemiInfiniteProgram:
         """Return the program, whose `origin` is this statement."""
-        n, objective = self.decisions.n, self.objective
+        n, polynomial = self.decisions.n, self.polynomial
         q, weights = np.zeros(n), np.zeros(n)
-        q[objective.linear.positions] = objective.linear.coefficients
-        entries: list[tuple[int, int, float]] = []
-        for weight, (i, a), (j, b) in self.products:
-            entries += [(i, j, weight * a * b), (j, i, weight * a * b)]
+        for i, slope in polynomial.slopes.items():
+            q[i] = float(slope)
         for weight, (place, factor) in self.absolutes:
             if weight < 0.0:
                 raise InputError(
@@ -225,7 +241,7 @@ class StatedProgram:
         program = SemiInfiniteProgram(
             n=n,
             q=q,
-            P=require_convex("minimise", _build_quadratic(entries, n), n) if entries else None,
+            P=require_convex("minimise", _build_quadratic(polynomial.products, n), n) if polynomial.products else None,
             weights=weights,
             lower=lower,
             upper=upper,
@@ -233,7 +249,7 @@ class StatedProgram:
             h=_list_right_sides(inequalities),
             A=_build_matrix(equalities, n),
             b=_list_right_sides(equalities),
-            constant=objective.linear.constant,
+            constant=float(polynomial.constant),
             families=[ConstraintFamily.of_rows(name, rows) for name, rows in self.parsed],
         )
         vars(program)["origin"] = self
@@ -255,11 +271,24 @@ def _subtract_entry(term: AffineFunction, place: int) -> AffineFunction:
     return AffineFunction(term.constant, np.append(term.positions, place), np.append(term.coefficients, -1.0))
 
 
-def _build_quadratic(entries: Sequence[tuple[int, int, float]], n: int) -> object:
+def _list_distinct(terms: Sequence[AffineFunction]) -> tuple[AffineFunction, ...]:
+    """Return the functions that are more than one entry, each once."""
+    return tuple({id(term): term for term in terms if not _is_entry(term)}.values())
+
+
+def _number_terms(terms: Sequence[AffineFunction], first: int) -> dict[int, int]:
+    """Return the entry of the decision that stands for each function, by its ``id``."""
+    return {id(term): first + k for k, term in enumerate(terms)}
+
+
+def _build_quadratic(products: Mapping[tuple[int, int], Fraction], n: int) -> object:
+    """Return the matrix of products of entries, symmetric, with a factor of 2."""
     from scipy.sparse import csc_array
 
-    rows, columns, values = (np.array(numbers) for numbers in zip(*entries, strict=True))
-    return csc_array((values, (rows, columns)), shape=(n, n))
+    keys = np.array(list(products), dtype=int).reshape(-1, 2)
+    values = np.array([float(value) for value in products.values()])
+    rows, columns = np.concatenate([keys, keys[:, ::-1]]).T
+    return csc_array((np.tile(values, 2), (rows, columns)), shape=(n, n))
 
 
 def _build_matrix(terms: Sequence[AffineFunction], n: int) -> Array | None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import final
 
 import numpy as np
@@ -24,6 +27,11 @@ class AffineFunction:
     def key(self) -> tuple[float, tuple[int, ...], tuple[float, ...]]:
         """Numbers that two equal functions have in common."""
         return self.constant, tuple(self.positions.tolist()), tuple(self.coefficients.tolist())
+
+    @property
+    def multiples(self) -> list[tuple[int, float]]:
+        """Entries of the decision with their coefficients."""
+        return list(zip(self.positions.tolist(), self.coefficients.tolist(), strict=True))
 
     @staticmethod
     def list_terms(form: AffineForm) -> list[AffineFunction]:
@@ -49,6 +57,19 @@ class AffineFunction:
         coefficients[np.searchsorted(positions, self.positions)] = self.coefficients
         coefficients[np.searchsorted(positions, term.positions)] += factor * term.coefficients
         return AffineFunction(self.constant + factor * term.constant, positions, coefficients)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Polynomial:
+    """Exact polynomial ``constant + sum slopes_i x_i + sum products_ij x_i x_j`` of a decision, with ``i <= j``.
+
+    Nothing that cancels is in it: no coefficient is 0.
+    """
+
+    constant: Fraction
+    slopes: Mapping[int, Fraction]
+    products: Mapping[tuple[int, int], Fraction]
 
 
 @final
@@ -88,3 +109,49 @@ class StatedObjective:
                 else:
                     linear = replace(linear, constant=linear.constant + weight * abs(inner.constant))
         return StatedObjective(linear, tuple(products), tuple(absolutes))
+
+    @property
+    def is_sum_of_squares(self) -> bool:
+        """Whether all products are squares with weights that are not negative."""
+        return all(left is right and weight >= 0.0 for weight, left, right in self.products)
+
+    def count_pairs(self) -> int:
+        """Return the number of products of entries, where every product of functions is multiplied out."""
+        return sum((left.positions.size + 1) * (right.positions.size + 1) for _, left, right in self.products)
+
+    def expand(self, places: Mapping[int, int]) -> Polynomial:
+        """Return the affine terms and the products as a polynomial.
+
+        Parameters
+        ----------
+        places : mapping from int to int
+            Entry of the decision that stands for a function, by the function's ``id``. Other functions are multiplied
+            out.
+        """
+        constant = Fraction(self.linear.constant)
+        slopes, products = defaultdict[int, Fraction](Fraction), defaultdict[tuple[int, int], Fraction](Fraction)
+        for i, coefficient in self.linear.multiples:
+            slopes[i] += Fraction(coefficient)
+        for weight, left, right in self.products:
+            (a, first), (b, second) = (_list_multiples(term, places) for term in (left, right))
+            scale = Fraction(weight)
+            constant += scale * a * b
+            for i, factor in first:
+                slopes[i] += scale * b * factor
+            for j, factor in second:
+                slopes[j] += scale * a * factor
+            for i, factor in first:
+                for j, second_factor in second:
+                    products[min(i, j), max(i, j)] += scale * factor * second_factor
+        return Polynomial(
+            constant,
+            {i: value for i, value in slopes.items() if value},
+            {key: value for key, value in products.items() if value},
+        )
+
+
+def _list_multiples(term: AffineFunction, places: Mapping[int, int]) -> tuple[Fraction, list[tuple[int, Fraction]]]:
+    """Return the constant of a function, and its entries with their coefficients; an entry may stand for all of it."""
+    if id(term) in places:
+        return Fraction(0), [(places[id(term)], Fraction(1))]
+    return Fraction(term.constant), [(i, Fraction(coefficient)) for i, coefficient in term.multiples]

@@ -59,6 +59,8 @@ class PlainRows(Working):
         Solution with these rows, from which the next one starts.
     sheds : bool
         Whether idle rows are dropped.
+    spent : float
+        Margin with which the last answer was found, before the answer lowered it.
     """
 
     rows: Rows = field(default_factory=lambda: Rows.none(0))
@@ -68,6 +70,7 @@ class PlainRows(Working):
     idle: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     guess: FiniteSolution | None = None
     sheds: bool = True
+    spent: float = 0.0
 
     @staticmethod
     def start(program: SemiInfiniteProgram, tools: Tools, exact: bool, close: Close) -> PlainRows:
@@ -160,6 +163,7 @@ class PlainRows(Working):
         if usable(solution):
             self.guess = solution
             ledger.improve(ledger.relaxed.lower_bound(self.rows, solution))
+            self.spent = self.margin
             self.pay(ledger, CheckedAnswer(solution, self.rows, epsilon, solution.value))
         return solution
 
@@ -174,9 +178,12 @@ class PlainRows(Working):
     def sharpen(self, ledger: Ledger, answer: CheckedAnswer) -> bool:
         """Improve the lower bound by the unregularised program, and continue without the regulariser.
 
-        This step is the last one, for a regulariser that is not exact at its smallest weight. False is returned where
+        This step is the last one, for a regulariser that is not exact at its smallest weight. Where the answer costs so
+        little that its margin had to be lowered, it is solved once more with the new one. False is returned where
         nothing is left to try.
         """
+        if self.margin < self.spent:
+            return True
         if self.epsilon == 0.0 or not self.exact:
             return False
         plain = self._solve_unregularised(ledger)

@@ -17,6 +17,7 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut, Dual
+from sparserob_core.sip.inner.duality import balance_rows
 from sparserob_core.sip.inner.vertex import simplex
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
@@ -33,6 +34,8 @@ FALLS = 1e-7  # of the largest coefficient: fall of the cost per unit of a direc
 # are a thousand indices.
 FEW = 8
 DENSE = 2  # first rows of a family for every variable: with one, polynomials take twice as long, with four filters do
+DENSER = 2  # points more along every coordinate: both parities are tried; ten more are many rows in four coordinates
+MANY = 300  # entries of a decision up to which its first rows are looked at: ten times as many take a minute
 SHOWN = 6  # largest number of entries of a ray in the message
 
 
@@ -86,16 +89,27 @@ def first_rows(program: SemiInfiniteProgram) -> list[tuple[Array, np.ndarray, st
 
     A family gets at least `DENSE` indices for every variable of the decision, and as many more, if at most `FEW`
     coordinates of its index can move; otherwise it gets one index. They are dense at the faces of the index set, where
-    polynomials and cosines grow most (nodes of Chebyshev). Nothing is returned where the decision has bounds.
+    polynomials and cosines grow most (nodes of Chebyshev). Where such a grid happens to meet the zeros of a term, as
+    that of three angles does for a sine, it does not bound the decision, and one with more points is tried. Nothing is
+    returned where the decision has bounds.
     """
-    rows: list[tuple[Array, np.ndarray, str]] = []
     if _has_bounds(program):
-        return rows
+        return []
+    first = _list_grid_rows(program, 0)
+    if program.n > MANY:
+        return first
+    grids = (first, *(_list_grid_rows(program, more) for more in range(1, DENSER + 1)))
+    return next((rows for rows in grids if _is_bounded_by(program, rows)), first)
+
+
+def _list_grid_rows(program: SemiInfiniteProgram, more: int) -> list[tuple[Array, np.ndarray, str]]:
+    """Return the rows of all families on grids, with so many ``more`` points along every coordinate that moves."""
+    rows: list[tuple[Array, np.ndarray, str]] = []
     for family in program.families:
         box = family.index_set
         free_axes = np.flatnonzero(box.upper > box.lower)
         count = DENSE * (program.n + 1) if free_axes.size <= FEW else 1
-        side = int(np.ceil(count ** (1.0 / max(1, free_axes.size)) - 1e-9))
+        side = int(np.ceil(count ** (1.0 / max(1, free_axes.size)) - 1e-9)) + more * (count > 1)
         share = 0.5 - 0.5 * np.cos(np.pi * np.arange(side) / max(1, side - 1)) if side > 1 else np.array([0.5])
         lines = [share if i in free_axes else np.zeros(1) for i in range(box.dimension)]
         unit = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, box.dimension)
@@ -103,6 +117,28 @@ def first_rows(program: SemiInfiniteProgram) -> list[tuple[Array, np.ndarray, st
         each = family.violations(np.zeros(program.n), indices[:1]).shape[1]
         rows.append((np.repeat(indices, each, axis=0), np.tile(np.arange(each), len(indices)), family.name))
     return rows
+
+
+def _is_bounded_by(program: SemiInfiniteProgram, rows: Violated) -> bool:
+    """Return whether rows, together with those without an index, bound the entries of cheap decisions that neither a
+    bound nor a square holds."""
+    base = program.finite
+    free, finite = _list_free_entries(program), np.isfinite(base.h)
+    table, equalities = np.vstack([rows_of(program, rows).G, base.G[finite]])[:, free], base.A[:, free]
+    if np.linalg.matrix_rank(np.vstack([table, equalities])) < int(free.sum()):
+        return False  # a column of rounding only, which a linear program does not see
+    return balance_rows(table, equalities, base.q[free]) is not None
+
+
+def _list_free_entries(program: SemiInfiniteProgram) -> np.ndarray:
+    """Return which entries of a decision have neither two bounds nor a curvature; all of one with an image."""
+    base = program.finite
+    if base.S is not None:
+        return np.ones(program.n, dtype=bool)
+    free = np.isinf(base.lower) | np.isinf(base.upper)
+    if base.P is not None:
+        free &= (base.curvature if base.curvature is not None else base.P.diagonal()) == 0.0
+    return np.asarray(free)
 
 
 def bounding_rows(
@@ -172,8 +208,8 @@ def complete_multipliers(program: SemiInfiniteProgram, dual: Dual, is_priced: bo
     """Return multipliers that can be moved so that every entry without bounds has exactly the slope that it needs.
 
     As many of them as there are such entries have to be positive, and their rows independent. Where they are fewer,
-    small multiples of a positive combination of rows are added, in which those entries cancel. It exists where the rows
-    bound these entries (Stiemke 1915). The bound then loses the share `SPENT` of itself.
+    small multiples of a positive combination of rows and the cost are added, in which those entries cancel
+    (`balance_rows`). The bound then loses the share `SPENT` of itself.
 
     Parameters
     ----------
@@ -185,10 +221,7 @@ def complete_multipliers(program: SemiInfiniteProgram, dual: Dual, is_priced: bo
         Whether they prove a bound of the cost; otherwise they prove that nothing is feasible.
     """
     base = program.finite
-    free = np.isinf(base.lower) | np.isinf(base.upper)
-    if is_priced and base.P is not None:
-        curvature = base.curvature if base.curvature is not None else base.P.diagonal()
-        free &= curvature == 0.0
+    free = _list_free_entries(program) if is_priced else np.isinf(base.lower) | np.isinf(base.upper)
     if not free.any() or dual.mu.size != base.b.size:
         return dual
     own_cuts = sorted(dual.cuts, key=lambda cut: cut.family)
@@ -199,37 +232,24 @@ def complete_multipliers(program: SemiInfiniteProgram, dual: Dual, is_priced: bo
     rows = own.joined(rows_of(program, first_rows(program)))
     finite = np.isfinite(base.h)
     table = np.vstack([rows.G, base.G[finite]])
-    right, count = np.concatenate([rows.h, base.h[finite]]), len(table)
+    right = np.concatenate([rows.h, base.h[finite]])
     if np.linalg.matrix_rank(np.vstack([table, base.A])[:, free]) < int(free.sum()):
         return dual
-    from scipy.optimize import linprog
-
-    found = linprog(
-        np.concatenate([np.zeros(count + base.b.size), [-1.0]]),
-        A_ub=np.vstack(
-            [
-                np.hstack([-np.eye(count), np.zeros((count, base.b.size)), np.ones((count, 1))]),
-                np.concatenate([np.ones(count), np.zeros(base.b.size + 1)])[None],
-            ]
-        ),
-        b_ub=np.concatenate([np.zeros(count), [float(count)]]),
-        A_eq=np.hstack([table[:, free].T, base.A[:, free].T, np.zeros((int(free.sum()), 1))]),
-        b_eq=np.zeros(int(free.sum())),
-        bounds=[(0.0, None)] * count + [(None, None)] * base.b.size + [(0.0, 1.0)],
-        method="highs",
-    )
-    if found.status != 0 or not found.x[-1] > 0.0:
+    cost = base.q[free] if is_priced else np.zeros(int(free.sum()))
+    combination = balance_rows(table[:, free], base.A[:, free], cost)
+    if combination is None:
         return dual
-    added, moved = found.x[:count], found.x[count:-1]
+    added, moved, factor = combination
     size = abs(dual.bound) if is_priced else float(sum(cut.multiplier for cut in dual.cuts))
     loss = float(np.abs(added) @ np.abs(right) + np.abs(moved) @ np.abs(base.b)) or 1.0
     share = SPENT * (size or 1.0) / loss
-    y = np.concatenate([[cut.multiplier for cut in own_cuts], np.zeros(rows.h.size - own.h.size)])
+    kept = 1.0 - share * factor
+    y = kept * np.concatenate([[cut.multiplier for cut in own_cuts], np.zeros(rows.h.size - own.h.size)])
     y = y + share * added[: rows.h.size]
-    fixed = fixed.copy()
+    fixed = kept * fixed
     fixed[finite] += share * added[rows.h.size :]
     cuts = tuple(replace(cut, multiplier=float(value)) for cut, value in zip(rows.cuts, y, strict=True))
-    return replace(dual, cuts=cuts, fixed=fixed, mu=dual.mu + share * moved)
+    return replace(dual, cuts=cuts, fixed=fixed, mu=kept * dual.mu + share * moved)
 
 
 def _group_by_family(cuts: Sequence[Cut]) -> list[tuple[Array, np.ndarray, str]]:

@@ -8,6 +8,7 @@ import pytest
 from flint import arb, ctx
 
 from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.program import bound
 from sparserob_core.checker.program.bound import Lagrangian, row_of_term
 from sparserob_core.sip.stated.statement import StatedProgram
 from tests.support.stated import state
@@ -176,3 +177,31 @@ def test_no_multipliers_of_random_programs_prove_more_than_a_feasible_decision_c
             answers += found.is_finite()
             assert not found.is_finite() or found.lower() <= value + 1e-12
     assert answers >= 8
+
+
+SEMIDEFINITE = {  # with a line along which the sum is 0, so that balls decide nothing
+    "(x + y)*(x + y + 2)": True,
+    "(x - 3*y)*(2*x - 6*y)": True,
+    "x*x - 2*x*y + y*y": True,
+    "x*x - 2*x*y + y*y - 1e-300*y*y": False,
+    "x*x - 2.0000000000000004*x*y + y*y": False,
+    "x*y": False,
+}
+
+
+@pytest.mark.parametrize("text", SEMIDEFINITE)
+def test_sums_of_products_that_vanish_along_a_line_are_judged_in_fractions(text: str) -> None:
+    program = state({"x": None, "y": None}, text, "x + y >= t")
+    lagrangian = Lagrangian(program, [], None, is_priced=True)
+    if SEMIDEFINITE[text]:
+        lagrangian.require_convex()
+    else:
+        with pytest.raises(Broken, match="not convex"):
+            lagrangian.require_convex()
+
+
+def test_large_sums_that_may_vanish_are_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    lagrangian = Lagrangian(state({"x": None, "y": None}, "x*x - 2*x*y + y*y", "x >= t"), [], None, is_priced=True)
+    monkeypatch.setattr(bound, "MAX_EXACT", 1)
+    with pytest.raises(Unchecked, match="more than 1 entries"):
+        lagrangian.require_convex()

@@ -157,3 +157,47 @@ def test_a_decision_of_too_many_terms_is_refused(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(statement, "MAX_ENTRIES", 20)
     with pytest.raises(InputError, match="minimise: expected at most 20 terms, got 30"):
         state({"a": 2}, "sum((a[0] - k - 1)**2 for k in range(30))", "a[0] >= t").build()
+
+
+TOGETHER = {  # with the same polynomial, multiplied out by hand
+    "(x + y)*(x - y) + 2*y^2": "x^2 + y^2",
+    "(x + y)^2 + (x - y)^2 - x^2": "x^2 + 2*y^2",
+    "(x - y)^2 + x*y": "x^2 - x*y + y^2",
+    "(x + y - 1)*(x - y + 2) + 3*y^2": "x^2 + x + 2*y^2 + 3*y - 2",
+    "2*(3 - x)*(x - 3*y)*(-1) + 6*(x - 3)*y + abs(x - y - 1)": "2*x^2 - 6*x + abs(x - y - 1)",
+    "(x + y)*(x + y + 2) + y*(y - x) + x*y": "(x + y)^2 + 2*x + 2*y + y^2",
+}
+
+
+@pytest.mark.parametrize("text", TOGETHER)
+def test_products_are_convex_together(text: str) -> None:
+    """The least value is that of the polynomial, which is a sum of squares; no product is judged by itself."""
+    programs = [state({"x": None, "y": None}, minimise, "x + y >= 1 + t") for minimise in (text, TOGETHER[text])]
+    first, second = (sr.solve(program.build()) for program in programs)
+    assert first.status == second.status == "certified"
+    assert first.cost == pytest.approx(second.cost, abs=1e-7)
+    rng = np.random.default_rng(0)
+    for x in rng.normal(size=(5, 2)):
+        polynomial, objective = programs[0].polynomial, programs[0].objective
+        hidden = [float(term.constant + term.coefficients @ x[term.positions]) for term in programs[0].residuals]
+        every = [*x, *hidden]
+        value = float(polynomial.constant) + sum(float(c) * every[i] for i, c in polynomial.slopes.items())
+        value += sum(float(c) * every[i] * every[j] for (i, j), c in polynomial.products.items())
+        value += sum(weight * abs(every[i] * factor) for weight, (i, factor) in programs[0].absolutes)
+        names = {"x": x[0], "y": x[1], "abs": abs}
+        assert value == pytest.approx(eval(text.replace("^", "**"), names), abs=1e-12)
+        assert objective.count_pairs() > 0
+
+
+@pytest.mark.parametrize("text", ["(x + y)*(x - y)", "x*y", "(x + y)^2 - (x - y)^2", "(x - y)^2 - 0.01*x^2 - 0.01*y^2"])
+def test_products_that_are_not_convex_together_are_refused(text: str) -> None:
+    with pytest.raises(InputError, match="minimise: expected a positive semidefinite matrix"):
+        state({"x": None, "y": None}, text, "x + y >= 1 + t").build()
+
+
+def test_squares_alone_are_never_multiplied_out() -> None:
+    """So that least squares keep the condition of their matrix."""
+    text = "sum((sum(a[k]*c[i]^k for k in range(3)) - c[i])^2 for i in range(5))"
+    program = state({"a": 3}, text, "a[0] >= t", tables={"c": [0.1, 0.2, 0.4, 0.7, 1.0]})
+    assert len(program.residuals) == 5
+    assert sorted(program.polynomial.products) == [(i, i) for i in range(3, 8)]

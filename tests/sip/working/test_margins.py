@@ -155,3 +155,14 @@ def test_what_is_violated_is_imposed_once(kind: str) -> None:
     assert working.size == 2
     assert answer(working, ledger).solution.x == pytest.approx([0.75], abs=1e-6)
     assert isinstance(found.solution, FiniteSolution)
+
+
+def test_a_cost_that_falls_far_in_the_last_round_gets_the_margin_that_it_can_pay_for():
+    """The first decision costs twenty times as much as the optimum, so that its margin is more than the gap."""
+    rows = "s^2*(1 - 3.8*r*(1 - r)) + 2*(1 - s)^2 + s*(1.6*r - 0.6)*(1 - s) >= t"
+    family = sr.ConstraintFamily.from_expressions(
+        "form", index={"s": (0.0, 1.0), "r": (0.0, 1.0)}, rows=rows, decision={"t": None}
+    )
+    result = sr.solve(sr.SemiInfiniteProgram(n=1, q=[-1.0], families=[family]))
+    assert result.status == "certified"
+    assert abs(result.cost + 0.05) <= 1e-8  # at s = 1 and r = 1/2

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.sip.inner.duality import balance_rows
 from sparserob_core.sip.working import unbounded
 from tests.support.oscillating import PROGRAMS
 
@@ -65,3 +66,32 @@ def test_the_price_of_an_option_on_the_largest_of_three_is_bounded_from_its_mome
     result = sr.solve(sr.SemiInfiniteProgram(n=10, q=moments, families=families))
     assert abs(result.cost - published) <= 0.005
     assert abs(result.cost - result.lower_bound) <= 1e-6
+
+
+def test_first_rows_that_meet_the_zeros_of_a_sine_are_replaced_by_more():
+    """Three angles from 0 to a full turn leave the factor of a sine without a row; four leave cosines of one sign."""
+    rows = "(exp(x) - a)*cos(q) + (sin(3*x) - b)*sin(q) <= d"
+    index = {"x": (-1.0, 1.0), "q": (0.0, 2.0 * np.pi)}
+    family = sr.ConstraintFamily.from_expressions("e", index=index, rows=rows, decision=dict.fromkeys("abd"))
+    program = sr.SemiInfiniteProgram(n=3, q=[0.0, 0.0, 1.0], families=[family])
+    ((indices, _, _),) = unbounded.first_rows(program)
+    assert len(indices) == 25
+    result = sr.solve(program)
+    assert result.status == "certified"
+    x = np.linspace(-1.0, 1.0, 2001)
+    curve = np.column_stack([np.exp(x), np.sin(3.0 * x)])
+    distance = np.linalg.norm(curve - result.decision[:2], axis=1).max()
+    assert abs(distance - result.cost) <= 1e-6  # the radius of the smallest circle around the curve
+    ends = np.linalg.norm(curve[:, None] - curve[None, ::10], axis=2).max() / 2
+    assert result.cost >= ends - 1e-6
+
+
+def test_rows_that_bound_a_program_have_a_positive_combination_with_its_cost():
+    rows, cost = np.array([[1.0, -1.0], [-1.0, -1.0]]), np.array([0.0, 1.0])
+    y, _, factor = balance_rows(rows, np.zeros((0, 2)), cost)
+    assert (y > 0.0).all()
+    assert np.abs(y @ rows + factor * cost).max() <= 1e-9
+    assert balance_rows(rows, np.zeros((0, 2)), np.zeros(2)) is None  # the second entry rises for ever
+    assert balance_rows(rows[:1], np.zeros((0, 2)), cost) is None
+    y, mu, factor = balance_rows(rows[:1], np.array([[1.0, 0.0]]), cost)
+    assert np.abs(y @ rows[:1] + mu @ np.array([[1.0, 0.0]]) + factor * cost).max() <= 1e-9

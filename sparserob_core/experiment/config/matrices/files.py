@@ -1,4 +1,5 @@
-"""Matrices from files, ``{file: plant.npz, name: A}``: data only, whose numbers replace the entry of the config."""
+"""Matrices from files, ``{file: plant.npz, name: A}`` or ``{file: prices.csv}``: data only, whose numbers replace the
+entry of the config."""
 
 from __future__ import annotations
 
@@ -13,6 +14,7 @@ from sparserob_core.encodings import path_of
 from sparserob_core.errors import InputError, Path
 from sparserob_core.experiment.config.matrices.arrays import read_arrays
 from sparserob_core.experiment.config.matrices.packed import Packed, checked, pack, shape_of, spread
+from sparserob_core.experiment.config.matrices.text_tables import read_table
 from sparserob_core.experiment.plugins.messages import Complaint, shown
 from sparserob_core.sip.convex_set import Array
 
@@ -22,11 +24,11 @@ LARGEST = 2**28  # bytes of the arrays of a file; a tenth of it would refuse den
 # Characters of all matrices of a config, which is read back as one text of at most four million. Ten times more takes
 # a minute to read; a tenth would refuse dense matrices of 200 states.
 MAX_TEXT = 3_500_000
-SUFFIX = ".npz"
+SUFFIX, TABLE = ".npz", ".csv"
 
 
 def resolve(data: dict[str, Any], folder: Callable[[Path], File]) -> Iterator[Complaint]:
-    """Replace every ``{file: ..., name: ...}`` of the problem by the numbers of the file; yields the faults.
+    """Replace every ``{file: ..., name: ...}`` and ``{file: ...}`` of the problem by its numbers; yields the faults.
 
     ``folder`` maps the path of a key to the folder that its file is relative to.
     """
@@ -49,25 +51,33 @@ def _find_references(data: Any, path: Path) -> Iterator[tuple[Path, Any, Any]]:
     there."""
     entries = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
     for key, value in entries:
-        if isinstance(value, Mapping) and set(value) == KEYS:
+        if isinstance(value, Mapping) and (set(value) == KEYS or _is_file_alone(value)):
             yield (*path, key), data, key
         else:
             yield from _find_references(value, (*path, key))
 
 
+def _is_file_alone(value: Mapping[str, object]) -> bool:
+    return set(value) == {"file"} and isinstance(value["file"], str)
+
+
 def _read_matrix(given: Mapping[str, object], folder: File, known: dict[File, dict[str, Array]]) -> Packed:
-    name, file_name = given["name"], given["file"]
-    if not isinstance(file_name, str) or not file_name.endswith(SUFFIX):
-        raise InputError(path="file", expected=f"a file whose name ends with {SUFFIX}", got=shown(file_name))
-    if not isinstance(name, str) or not name:
+    name, file_name = given.get("name"), given["file"]
+    if not isinstance(file_name, str) or not file_name.endswith((SUFFIX, TABLE)):
+        raise InputError(path="file", expected=f"a file whose name ends with {SUFFIX} or {TABLE}", got=shown(file_name))
+    file, is_table = folder / path_of(file_name), file_name.endswith(TABLE)
+    if is_table and "name" in given:
+        raise InputError(path="name", expected=f"no name, since a file {TABLE} holds one matrix", got=shown(name))
+    if not is_table and (not isinstance(name, str) or not name):
         raise InputError(path="name", expected="the name of a matrix in the file", got=shown(name))
-    file = folder / path_of(file_name)
+    if file not in known and not file.is_file():
+        raise InputError(path="file", expected=f"a file, relative to {folder}", got=f"{file_name}, which is none")
+    if is_table:
+        return read_table(file)
     if file not in known:
-        if not file.is_file():
-            raise InputError(path="file", expected=f"a file, relative to {folder}", got=f"{file_name}, which is none")
         known[file] = read_arrays(file, LARGEST)
     try:
-        return matrix_in(known[file], name)
+        return matrix_in(known[file], str(name))
     except InputError as error:
         error.path = (file_name, *error.path)
         raise

@@ -150,10 +150,12 @@ def checked(matrix: Array, where: str) -> Packed:
 class OrPacked:
     """The mark of rows of a config that may also be a matrix from a file, or one in one text.
 
-    With ``column`` it marks a list of numbers, which may be a matrix of one column.
+    With ``column`` it marks a list of numbers, which may be a matrix of one column. With ``line`` it marks a list or
+    rows, and a matrix of one row or column is a list.
     """
 
     column: bool = False
+    line: bool = False
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         return core_schema.no_info_wrap_validator_function(
@@ -166,7 +168,7 @@ class OrPacked:
         from_file = {
             "type": "object",
             "properties": {"file": {"type": "string"}, "name": {"type": "string"}},
-            "required": ["file", "name"],
+            "required": ["file"],
             "additionalProperties": False,
         }
         return {"anyOf": [handler(schema), from_file]}
@@ -176,7 +178,10 @@ class OrPacked:
             return value
         if not isinstance(value, Mapping):
             return handler(value)
-        return handler(unpack(value).column) if self.column else unpack(value)
+        matrix = unpack(value)
+        if self.line and 1 in matrix.array.shape:
+            return handler(matrix.array.ravel().tolist())
+        return handler(matrix.column) if self.column else matrix
 
 
 def _pack_value(value: object, handler: SerializerFunctionWrapHandler) -> object:
