@@ -143,7 +143,7 @@ def test_no_claim_of_a_random_plant_is_wrong_by_more_than_its_excuse(number: int
         assert "fails" not in verdicts(outcome).values()
 
 
-@pytest.mark.parametrize("config", ["pendulum_transfer", "libration_point"])
+@pytest.mark.parametrize("config", ["pendulum_transfer", "libration_point", "magnetic_levitation"])
 def test_values_of_plants_that_grow_are_those_of_states_at_nodes(config: str, tmp_path: Path) -> None:
     """Walls of the reference hold at some times only, so that it may cost a little less."""
     outcome = sr.run(CONFIGS / f"{config}.yaml", out=tmp_path / "run", quiet=True, figures=False)

@@ -26,6 +26,7 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "ion_trap": ("certified", 1.9118966, 1e-7),
     "breakpoints": ("certified", None, 0.0),
     "cart_pendulum": ("certified", 0.3281469, 2e-7),
+    "magnetic_levitation": ("certified", 0.019403724, 1e-7),
     "libration_point": ("certified", 6.30650562, 1e-7),
     "pendulum_transfer": ("certified", 0.17286876, 1e-7),
     "coupled_masses": ("certified", 1.057952, 5e-6),
