@@ -59,6 +59,8 @@ class PlainRows(Working):
         Solution with these rows, from which the next one starts.
     sheds : bool
         Whether idle rows are dropped.
+    used : float
+        Margin of the last solution; the next one may have less.
     """
 
     rows: Rows = field(default_factory=lambda: Rows.none(0))
@@ -68,6 +70,7 @@ class PlainRows(Working):
     idle: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     guess: FiniteSolution | None = None
     sheds: bool = True
+    used: float = 0.0
 
     @staticmethod
     def start(program: SemiInfiniteProgram, tools: Tools, exact: bool, close: Close) -> PlainRows:
@@ -158,7 +161,7 @@ class PlainRows(Working):
         while solution.status == "infeasible" and self.thin():
             solution = ledger.relaxed.solve(self.rows, epsilon, self.margin, None)
         if usable(solution):
-            self.guess = solution
+            self.guess, self.used = solution, self.margin
             ledger.improve(ledger.relaxed.lower_bound(self.rows, solution))
             self.pay(ledger, CheckedAnswer(solution, self.rows, epsilon, solution.value))
         return solution
@@ -174,9 +177,11 @@ class PlainRows(Working):
     def sharpen(self, ledger: Ledger, answer: CheckedAnswer) -> bool:
         """Improve the lower bound by the unregularised program, and continue without the regulariser.
 
-        This step is the last one, for a regulariser that is not exact at its smallest weight. False is returned where
-        nothing is left to try.
+        This step is the last one, for a regulariser that is not exact at its smallest weight. A margin that was reduced
+        since the answer is another reason to continue. False is returned where nothing is left to try.
         """
+        if self.margin < self.used:
+            return True
         if self.epsilon == 0.0 or not self.exact:
             return False
         plain = self._solve_unregularised(ledger)
