@@ -7,7 +7,6 @@ that depends on an index or on the decision is enclosed.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import count
 
 import numpy as np
 from flint import arb
@@ -22,7 +21,7 @@ from sparserob_core.sip.expressions.expression import Value
 from sparserob_core.sip.expressions.rows import ExpressionRows
 from sparserob_core.sip.expressions.statements import StatedRow
 
-DEGREES = {1: (14, 0), 2: (7, 7), 3: (4, 4)}
+DEGREES = {1: (24, 0), 2: (7, 7), 3: (4, 4)}
 """Orders in the first coordinate and in the others, for so many of them; 2 for more. Half of them need ten times as
 many cells, twice as many take four times as long for each."""
 SHARP = 0.01  # of a limit: bounds above it are sharpened, since what is excused is priced; with a tenth it is rounding
@@ -30,37 +29,40 @@ SHARPENED = 5  # halvings for that: ten times as many follow what really violate
 MAX_CELLS = 20_000  # of one row: ten times as many take hours, a tenth refuses filters of a thousand taps
 
 
-def bound_violation(rows: ExpressionRows, row: StatedRow, x: Array, limit: float, clock: Clock) -> float:
-    """Return a proven upper bound of the violation of a row at a decision, over all indices.
+def bound_violation(rows: ExpressionRows, x: Array, limit: float, clock: Clock) -> float:
+    """Return a proven upper bound of the violation of all rows at a decision, over all indices.
 
-    Raises `Broken` where an index violates it by more than the ``limit``, and `Unchecked` where too many cells are
-    needed.
+    Rows are bounded together, since they often contain the same expressions. Raises `Broken` where an index violates a
+    row by more than the ``limit``, and `Unchecked` where too many cells are needed.
     """
-    work, worst = [(rows.lower, rows.upper, 0)], -np.inf
+    work, worst = [(rows.lower, rows.upper, 0, list(rows.rows))], -np.inf
     frame = _make_frame(rows.dimension)
     decision = np.array([frame.number(ball(value)) for value in x], dtype=object)
-    for number in count():
-        if not work:
-            return worst
-        if number > MAX_CELLS:
-            raise Unchecked(f"more than {MAX_CELLS} cells of {row.text!r} are needed")
+    bounded = 0
+    while work:
         clock.check()
-        lower, upper, sharpened = work.pop()
-        bound = _bound_cell(rows, row, frame, decision, lower, upper)
-        if bound <= (SHARP * limit if sharpened < SHARPENED else limit):
-            worst = max(worst, bound)
+        lower, upper, sharpened, open_rows = work.pop()
+        bounded += len(open_rows)
+        if bounded > MAX_CELLS * len(rows.rows):
+            raise Unchecked(f"more than {MAX_CELLS} cells of each row such as {open_rows[0].text!r} are needed")
+        bounds = _bound_cell(rows, open_rows, frame, decision, lower, upper)
+        is_closed = bounds <= (SHARP * limit if sharpened < SHARPENED else limit)
+        worst = max(worst, bounds[is_closed].max(initial=-np.inf))
+        if is_closed.all():
             continue
-        sharpened += bound <= limit
+        still_open = [row for row, closed in zip(open_rows, is_closed.tolist(), strict=True) if not closed]
+        sharpened += bool((bounds <= limit).all())
         middle = lower + (upper - lower) / 2
-        _require_kept(rows, row, x, middle, limit)
+        for row in still_open:
+            _require_kept(rows, row, x, middle, limit)
         shares = (upper - lower) / np.maximum(rows.upper - rows.lower, np.finfo(float).tiny)
         axis = int(shares.argmax())
         if not lower[axis] < middle[axis] < upper[axis]:
-            raise Unchecked(f"no cell around the index {middle.tolist()} is short enough for {row.text!r}")
+            raise Unchecked(f"no cell around the index {middle.tolist()} is short enough for {still_open[0].text!r}")
         low, high = lower.copy(), upper.copy()
         high[axis] = low[axis] = middle[axis]
-        work += [(lower, high, sharpened), (low, upper, sharpened)]
-    return worst
+        work += [(lower, high, sharpened, still_open), (low, upper, sharpened, still_open)]
+    return float(worst)
 
 
 def _make_frame(dimension: int) -> Frame:
@@ -69,23 +71,27 @@ def _make_frame(dimension: int) -> Frame:
 
 
 def _bound_cell(
-    rows: ExpressionRows, row: StatedRow, frame: Frame, decision: np.ndarray, lower: Array, upper: Array
-) -> float:
-    """Return an upper bound of the violation over one cell; infinite where the row has no enclosure there."""
+    rows: ExpressionRows, open_rows: list[StatedRow], frame: Frame, decision: np.ndarray, lower: Array, upper: Array
+) -> Array:
+    """Return upper bounds of the violations of some rows over one cell; infinite for a row without an enclosure
+    there."""
     values: dict[str, Value] = {}
     for i, name in enumerate(rows.words.indices):
         low, high = ball(float(lower[i])), ball(float(upper[i]))
         middle, half = (low + high) / 2, (high - low) / 2
         model = frame.time(middle, half) if i == 0 else frame.parameter(i - 1, middle, half)
         values[name] = np.array([[model]], dtype=object)
-    try:
-        violation = row.value(values, decision[None])[0, 0]
-    except (Unchecked, ValueError, ZeroDivisionError):
-        return np.inf
-    coefficients, error = _separate_errors(frame, violation)
-    if not np.isfinite(coefficients).all() or not np.isfinite(error):
-        return np.inf
-    return float(highest(coefficients[None], [True] * (lower.size), np.array([error]), 0.0)[0])
+    parts: dict[str, Value] = {}
+    tables, errors = [], []
+    for row in open_rows:
+        try:
+            violation = row.value(values, decision[None], parts)[0, 0]
+        except (Unchecked, ValueError, ZeroDivisionError):
+            violation = arb(np.inf)
+        coefficients, error = _separate_errors(frame, violation)
+        tables.append(coefficients)
+        errors.append(error)
+    return highest(np.array(tables), [True] * lower.size, np.array(errors), 0.0)
 
 
 def _separate_errors(frame: Frame, value: Value) -> tuple[Array, float]:
