@@ -153,8 +153,8 @@ def _collect_rows(
     rows = rows_of(recession, chosen)
     for number in range(ROUNDS):
         tools.deadline.check()
-        base = recession.finite
-        corner = simplex(replace(base, G=np.vstack([base.G, rows.G]), h=np.concatenate([base.h, rows.h])))
+        base, G = recession.finite, np.unique(rows.G, axis=0)  # rows that differ on the right alone are the same here
+        corner = simplex(replace(base, G=np.vstack([base.G, G]), h=np.concatenate([base.h, np.zeros(len(G))])))
         if corner.status != "optimal":
             return chosen, False
         if recession.cost(corner.x) >= -fall:
@@ -171,9 +171,10 @@ def _collect_rows(
 def complete_multipliers(program: SemiInfiniteProgram, dual: Dual, is_priced: bool) -> Dual:
     """Return multipliers that can be moved so that every entry without bounds has exactly the slope that it needs.
 
-    As many of them as there are such entries have to be positive, and their rows independent. Where they are fewer,
-    small multiples of a positive combination of rows are added, in which those entries cancel. It exists where the rows
-    bound these entries (Stiemke 1915). The bound then loses the share `SPENT` of itself.
+    As many of them as there are such entries have to be positive by more than rounding, and their rows independent.
+    Where they are fewer, small multiples of a positive combination of rows are added, in which those entries cancel,
+    alone or with a multiple of the cost. It exists where the rows bound these entries, alone or with the cost (Stiemke
+    1915). The bound then loses the share `SPENT` of itself.
 
     Parameters
     ----------
@@ -193,7 +194,9 @@ def complete_multipliers(program: SemiInfiniteProgram, dual: Dual, is_priced: bo
         return dual
     own_cuts = sorted(dual.cuts, key=lambda cut: cut.family)
     own, fixed = rows_of(program, _group_by_family(own_cuts)), dual.of_fixed_rows(base.h.size)
-    used = np.vstack([own.G, base.G[fixed > 0.0], base.A])[:, free]
+    multipliers = np.array([cut.multiplier for cut in own_cuts])
+    least = SPENT * max(multipliers.max(initial=0.0), fixed.max(initial=0.0))
+    used = np.vstack([own.G[multipliers > least], base.G[fixed > least], base.A])[:, free]
     if np.linalg.matrix_rank(used) == int(free.sum()):
         return dual
     rows = own.joined(rows_of(program, first_rows(program)))
@@ -204,32 +207,38 @@ def complete_multipliers(program: SemiInfiniteProgram, dual: Dual, is_priced: bo
         return dual
     from scipy.optimize import linprog
 
+    entries = int(free.sum())
     found = linprog(
-        np.concatenate([np.zeros(count + base.b.size), [-1.0]]),
+        np.concatenate([np.zeros(count + base.b.size + 1), [-1.0]]),
         A_ub=np.vstack(
             [
-                np.hstack([-np.eye(count), np.zeros((count, base.b.size)), np.ones((count, 1))]),
-                np.concatenate([np.ones(count), np.zeros(base.b.size + 1)])[None],
+                np.hstack([-np.eye(count), np.zeros((count, base.b.size + 1)), np.ones((count, 1))]),
+                np.concatenate([np.ones(count), np.zeros(base.b.size + 2)])[None],
             ]
         ),
         b_ub=np.concatenate([np.zeros(count), [float(count)]]),
-        A_eq=np.hstack([table[:, free].T, base.A[:, free].T, np.zeros((int(free.sum()), 1))]),
-        b_eq=np.zeros(int(free.sum())),
-        bounds=[(0.0, None)] * count + [(None, None)] * base.b.size + [(0.0, 1.0)],
+        A_eq=np.hstack([table[:, free].T, base.A[:, free].T, base.q[free, None], np.zeros((entries, 1))]),
+        b_eq=np.zeros(entries),
+        bounds=[(0.0, None)] * count + [(None, None)] * base.b.size + [(0.0, None if is_priced else 0.0), (0.0, 1.0)],
         method="highs",
     )
     if found.status != 0 or not found.x[-1] > 0.0:
         return dual
-    added, moved = found.x[:count], found.x[count:-1]
-    size = abs(dual.bound) if is_priced else float(sum(cut.multiplier for cut in dual.cuts))
-    loss = float(np.abs(added) @ np.abs(right) + np.abs(moved) @ np.abs(base.b)) or 1.0
+    added, moved, repeated = found.x[:count], found.x[count:-2], float(found.x[-2])
+    size = abs(dual.bound) if is_priced else float(multipliers.sum())
+    loss = float(np.abs(added) @ np.abs(right) + np.abs(moved) @ np.abs(base.b) + repeated * size) or 1.0
     share = SPENT * (size or 1.0) / loss
-    y = np.concatenate([[cut.multiplier for cut in own_cuts], np.zeros(rows.h.size - own.h.size)])
-    y = y + share * added[: rows.h.size]
+    y = np.concatenate([multipliers, np.zeros(rows.h.size - own.h.size)])
+    y = (y + share * added[: rows.h.size]) / (1.0 + share * repeated)
     fixed = fixed.copy()
     fixed[finite] += share * added[rows.h.size :]
     cuts = tuple(replace(cut, multiplier=float(value)) for cut, value in zip(rows.cuts, y, strict=True))
-    return replace(dual, cuts=cuts, fixed=fixed, mu=dual.mu + share * moved)
+    return replace(
+        dual,
+        cuts=cuts,
+        fixed=fixed / (1.0 + share * repeated),
+        mu=(dual.mu + share * moved) / (1.0 + share * repeated),
+    )
 
 
 def _group_by_family(cuts: Sequence[Cut]) -> list[tuple[Array, np.ndarray, str]]:
