@@ -82,12 +82,20 @@ PROGRAMS = {  # programs without a system, whose values are tested in known_answ
     "convex_fit",
     "equiripple",
     "kissing_number",
+    "long_filter",
+    "monotone_fit",
+    "narrow_filter",
     "one_sided_tangent",
     "option_moments",
+    "option_three_stocks",
     "reciprocal",
     "robust_portfolio",
     "triangle",
+    "watson5",
+    "watson7",
     "watson8",
+    "watson9",
+    "wiggly",
 }
 EXPECTED |= dict.fromkeys(PROGRAMS, ("certified", None, 0.0))
 UNCHECKED = {("experiment1_scenario", "lower bound")}  # its constraints are samples

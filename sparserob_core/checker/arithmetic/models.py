@@ -207,23 +207,21 @@ class Model:
         old_cap, ctx.cap = ctx.cap, count + 1
         try:
             expansion, enclosure = (function(arb_series([at, 1], count + 1)) for at in (c, arb(c, radius)))
-            coefficients, bounds = ([series[k] for k in range(count + 1)] for series in (expansion, enclosure))
         except (ValueError, ZeroDivisionError) as error:
             raise Unchecked(f"an entry of the system is not finite ({error})") from error
         finally:
             ctx.cap = old_cap
-        if not all(coefficient.is_finite() for coefficient in (*coefficients, *bounds)):
-            raise Unchecked("an entry of the system is not finite")
-        power, remainders, tolerance = arb(1), [], arb(ENOUGH) * abs(coefficients[0])
-        for bound in bounds[1:]:
+        power, remainders, tolerance = arb(1), list[arb](), arb(ENOUGH) * abs(expansion[0])
+        while len(remainders) < count and not (remainders and remainders[-1] <= tolerance):
             power = power * radius
-            remainders.append((abs(bound) * power).upper())
-        smallest = min(range(count), key=lambda k: float(remainders[k]))
-        order = next((k for k, remainder in enumerate(remainders) if remainder <= tolerance), smallest)
-        model = self.frame.number(coefficients[order])
-        for coefficient in reversed(coefficients[:order]):
-            model = model * deviation + self.frame.number(coefficient)
-        return model._truncate(remainders[order])
+            remainders.append((abs(enclosure[len(remainders) + 1]) * power).upper())
+        order = len(remainders) - 1
+        if not remainders[order] <= tolerance:
+            order = min(range(count), key=lambda k: float(remainders[k]))
+        coefficients = [expansion[k] for k in range(order + 1)]
+        if not all(number.is_finite() for number in (*coefficients, remainders[order])):
+            raise Unchecked("an entry of the system is not finite")
+        return _sum_powers(coefficients, deviation)._truncate(remainders[order])
 
     def exp(self) -> Model:
         return self._apply_function(lambda s: s.exp())
@@ -252,6 +250,18 @@ class Model:
     def kepler(self, eccentricity: float) -> Model:
         """Return the ``E`` that solves Kepler's equation ``E - e sin E = M``, where the model is ``M``."""
         return self._apply_function(lambda s: kepler_series(s, eccentricity, s.prec))
+
+
+def _sum_powers(coefficients: Sequence[arb], model: Model) -> Model:
+    """Return ``sum_k coefficients_k model^k``: as one polynomial in another where the model depends on the time alone,
+    and by Horner's rule otherwise."""
+    frame, (in_time, *others) = model.frame, model.parts
+    if in_time is not None and all(part is None for part in others):
+        return Model(frame, [arb_poly(coefficients)(in_time), *others])
+    total = frame.number(coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):
+        total = total * model + frame.number(coefficient)
+    return total
 
 
 def _bound_polynomial(part: arb_poly) -> arb:

@@ -115,7 +115,8 @@ class Lagrangian:
         corrected: set[int] = set()
         while free := [j for j in range(self.n) if j not in corrected and self._needs_correction(j, slope[j])]:
             corrected |= set(free)  # a correction moves other slopes too, so that they are looked at again
-            self._correct(sorted(corrected), slope)
+            self._take_middles()
+            self._correct(sorted(corrected), self._sum_slopes())
             slope = self._sum_slopes()
         total = self.constant + sum((row.multiplier * row.constant for row in self.rows), ball(0.0))
         if not self.is_diagonal:
@@ -124,6 +125,14 @@ class Lagrangian:
         return total + sum(
             (ball(0.0) if j in corrected else self._least_value(j, slope[j]) for j in range(self.n)), ball(0.0)
         )
+
+    def _take_middles(self) -> None:
+        """Replace multipliers and tangent by the middles of their balls. Any numbers will do, and balls of a correction
+        would widen with every further one."""
+        self.rows = [
+            WeightedRow(row.coefficients, row.constant, arb(row.multiplier.mid()), row.is_free) for row in self.rows
+        ]
+        self.tangent = [arb(value.mid()) for value in self.tangent]
 
     def _sum_slopes(self) -> list[arb]:
         slope = list(self.slope)

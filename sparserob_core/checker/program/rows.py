@@ -7,12 +7,12 @@ that depends on an index or on the decision is enclosed.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import count
 
 import numpy as np
 from flint import arb
 
-from sparserob_core.checker.arithmetic.balls import ball, rational
+from sparserob_core.checker.arithmetic.balls import above, ball, rational
+from sparserob_core.checker.arithmetic.bernstein import highest
 from sparserob_core.checker.arithmetic.models import Frame, Model
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
@@ -21,7 +21,7 @@ from sparserob_core.sip.expressions.expression import Value
 from sparserob_core.sip.expressions.rows import ExpressionRows
 from sparserob_core.sip.expressions.statements import StatedRow
 
-DEGREES = {1: (14, 0), 2: (7, 7), 3: (4, 4)}
+DEGREES = {1: (24, 0), 2: (7, 7), 3: (4, 4)}
 """Orders in the first coordinate and in the others, for so many of them; 2 for more. Half of them need ten times as
 many cells, twice as many take four times as long for each."""
 SHARP = 0.01  # of a limit: bounds above it are sharpened, since what is excused is priced; with a tenth it is rounding
@@ -29,36 +29,39 @@ SHARPENED = 5  # halvings for that: ten times as many follow what really violate
 MAX_CELLS = 20_000  # of one row: ten times as many take hours, a tenth refuses filters of a thousand taps
 
 
-def bound_violation(rows: ExpressionRows, row: StatedRow, x: Array, limit: float, clock: Clock) -> float:
-    """Return a proven upper bound of the violation of a row at a decision, over all indices.
+def bound_violation(rows: ExpressionRows, x: Array, limit: float, clock: Clock) -> float:
+    """Return a proven upper bound of the violation of all rows at a decision, over all indices.
 
-    Raises `Broken` where an index violates it by more than the ``limit``, and `Unchecked` where too many cells are
-    needed.
+    Rows are bounded together, since they often contain the same expressions. Raises `Broken` where an index violates a
+    row by more than the ``limit``, and `Unchecked` where too many cells are needed.
     """
-    work, worst = [(rows.lower, rows.upper, 0)], -np.inf
+    work, worst = [(rows.lower, rows.upper, 0, list(rows.rows))], -np.inf
     frame = _make_frame(rows.dimension)
     decision = np.array([frame.number(ball(value)) for value in x], dtype=object)
-    for number in count():
-        if not work:
-            return worst
-        if number > MAX_CELLS:
-            raise Unchecked(f"more than {MAX_CELLS} cells of {row.text!r} are needed")
+    bounded = 0
+    while work:
         clock.check()
-        lower, upper, sharpened = work.pop()
-        bound, steepness = _bound_cell(rows, row, frame, decision, lower, upper)
-        if bound <= (SHARP * limit if sharpened < SHARPENED else limit):
-            worst = max(worst, bound)
+        lower, upper, sharpened, open_rows = work.pop()
+        bounded += len(open_rows)
+        if bounded > MAX_CELLS * len(rows.rows):
+            raise Unchecked(f"more than {MAX_CELLS} cells of each row such as {open_rows[0].text!r} are needed")
+        bounds, models = _bound_cell(rows, open_rows, frame, decision, lower, upper)
+        is_closed = bounds <= (SHARP * limit if sharpened < SHARPENED else limit)
+        worst = max(worst, bounds[is_closed].max(initial=-np.inf))
+        if is_closed.all():
             continue
-        sharpened += bound <= limit
+        still_open = [row for row, closed in zip(open_rows, is_closed.tolist(), strict=True) if not closed]
+        sharpened += bool((bounds <= limit).all())
         middle = lower + (upper - lower) / 2
-        _require_kept(rows, row, x, middle, limit)
-        axis = int(steepness.argmax())
+        for row in still_open:
+            _require_kept(rows, row, x, middle, limit)
+        axis = _choose_axis(rows, bounds, models, lower, upper)
         if not lower[axis] < middle[axis] < upper[axis]:
-            raise Unchecked(f"no cell around the index {middle.tolist()} is short enough for {row.text!r}")
+            raise Unchecked(f"no cell around the index {middle.tolist()} is short enough for {still_open[0].text!r}")
         low, high = lower.copy(), upper.copy()
         high[axis] = low[axis] = middle[axis]
-        work += [(lower, high, sharpened), (low, upper, sharpened)]
-    return worst
+        work += [(lower, high, sharpened, still_open), (low, upper, sharpened, still_open)]
+    return float(worst)
 
 
 def _make_frame(dimension: int) -> Frame:
@@ -67,26 +70,50 @@ def _make_frame(dimension: int) -> Frame:
 
 
 def _bound_cell(
-    rows: ExpressionRows, row: StatedRow, frame: Frame, decision: np.ndarray, lower: Array, upper: Array
-) -> tuple[float, Array]:
-    """Return an upper bound of the violation over one cell, infinite where the row has no enclosure there, and by how
-    much it changes across the cell along each coordinate: by its part of the side of the box, where that is unknown."""
+    rows: ExpressionRows, open_rows: list[StatedRow], frame: Frame, decision: np.ndarray, lower: Array, upper: Array
+) -> tuple[Array, list[Model]]:
+    """Return upper bounds of the violations of some rows over one cell, infinite for a row without an enclosure there,
+    and the models of the violations."""
     coordinates: list[Value] = []
     for i, (start, stop) in enumerate(zip(lower.tolist(), upper.tolist(), strict=True)):
         low, high = ball(start), ball(stop)
         middle, half = (low + high) / 2, (high - low) / 2
         model = frame.time(middle, half) if i == 0 else frame.parameter(i - 1, middle, half)
         coordinates.append(np.array([[model]], dtype=object))
+    values = rows.piece.place(coordinates, lambda number: frame.number(rational(number)))
+    parts: dict[str, Value] = {}
+    models = []
+    for row in open_rows:
+        try:
+            violation = row.value(values, decision[None], parts)[0, 0]
+        except (Unchecked, ValueError, ZeroDivisionError):
+            violation = arb(np.inf)
+        models.append(violation if isinstance(violation, Model) else frame.number(arb(violation)))
+    tables, errors = zip(*(_separate_errors(frame, model) for model in models), strict=True)
+    return highest(np.array(tables), [True] * lower.size, np.array(errors), 0.0), models
+
+
+def _choose_axis(rows: ExpressionRows, bounds: Array, models: list[Model], lower: Array, upper: Array) -> int:
+    """Return the coordinate along which the worst row changes most across a cell; along which the cell has the largest
+    part of the side of the box, where that is unknown."""
     shares = (upper - lower) / np.maximum(rows.upper - rows.lower, np.finfo(float).tiny)
-    try:
-        values = rows.piece.place(coordinates, lambda number: frame.number(rational(number)))
-        violation = row.value(values, decision[None])[0, 0]
-    except (Unchecked, ValueError, ZeroDivisionError):
-        return np.inf, shares
-    model = violation if isinstance(violation, Model) else frame.number(arb(violation))
-    bound, steepness = model.highest(), model.steepness()
-    is_known = np.isfinite(bound) and (steepness[shares > 0.0] > 0.0).any()
-    return bound, np.where(shares > 0.0, steepness, -1.0) if is_known else shares
+    worst = int(bounds.argmax())
+    steepness = models[worst].steepness() if np.isfinite(bounds[worst]) else np.zeros(lower.size)
+    is_known = bool((steepness[shares > 0.0] > 0.0).any())
+    return int((np.where(shares > 0.0, steepness, -1.0) if is_known else shares).argmax())
+
+
+def _separate_errors(frame: Frame, model: Model) -> tuple[Array, float]:
+    """Return the middles of the coefficients of a model, and a bound of what they leave out."""
+    variables, degree = frame.monomials.count, frame.monomials.degree
+    coefficients = np.zeros((frame.order + 1, *([degree + 1] * variables)))
+    error = arb(0)
+    for exponents, part in zip(frame.monomials.exponents, model.parts, strict=True):
+        for power, coefficient in enumerate([] if part is None else part.coeffs()):
+            middle = float(coefficient.mid())
+            coefficients[(power, *exponents)] = middle
+            error = error + abs(coefficient - middle)
+    return coefficients, above(error)
 
 
 def _require_kept(rows: ExpressionRows, row: StatedRow, x: Array, index: Array, limit: float) -> None:

@@ -18,6 +18,7 @@ from sparserob_core.experiment.config.reading.overrides import Override, apply_o
 from sparserob_core.experiment.config.reading.reader import ConfigSource, read_source, read_value
 from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
 from sparserob_core.experiment.plugins.components import Registry
+from sparserob_core.experiment.plugins.hookspecs import ProblemPlugin
 from sparserob_core.experiment.plugins.messages import NOT_PLAIN, NOT_TEXT, Complaint, complaints, malformed, models_in
 from sparserob_core.experiment.plugins.registry import load_registry
 
@@ -146,6 +147,7 @@ def _build_registry(data: dict[str, Any], source: ConfigSource, changes: tuple[O
 def _check_data(data: dict[str, Any], registry: Registry, strangers: bool) -> tuple[RunConfig | None, list[Complaint]]:
     wrong: list[Complaint] = []
     checked: RunConfig | None = None
+    data = _state_regulariser(data, registry)
     try:
         checked = RunConfig.model_validate(data)
     except ValidationError as error:
@@ -166,6 +168,17 @@ def _check_data(data: dict[str, Any], registry: Registry, strangers: bool) -> tu
         if typed is not None:
             entry.update(typed.model_dump(mode="json", by_alias=True))
     return (RunConfig.model_validate(plain) if not wrong else None), wrong
+
+
+def _state_regulariser(data: dict[str, Any], registry: Registry) -> dict[str, Any]:
+    """Return the config with ``regulariser: null`` where it has no such key and its problem states all of its
+    objective."""
+    name = _get_value(data, ("problem", "name"))
+    if "regulariser" in data or name not in registry.names("problem"):
+        return data
+    record = registry.get("problem", name)
+    assert isinstance(record, ProblemPlugin)
+    return data if record.regularised else {**data, "regulariser": None}
 
 
 def _list_nested_keys(data: dict[str, Any], registry: Registry) -> Iterator[str]:

@@ -92,7 +92,8 @@ class RunConfig(Options):
     """Functions of time of which control and disturbance are combinations."""
 
     regulariser: Annotated[Entry | None, Slot("regulariser", "ridge")] = Entry(name="ridge")
-    """The strictly convex term that makes the optimiser unique; null for none."""
+    """The strictly convex term that makes the optimiser unique; null for none. A problem that states all of its
+    objective, such as ``program``, has none unless it is given here."""
 
     continuation: Continuation = Continuation()
     """Decrease of the regulariser's weight."""

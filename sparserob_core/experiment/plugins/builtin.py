@@ -119,5 +119,6 @@ def sparserob_problems() -> Iterator[ProblemPlugin]:
     yield ProblemPlugin(
         name="program",
         factory="sparserob_core.experiment.config.programs:ProgramProblem",
+        regularised=False,
         summary="A convex semi-infinite program as text: decisions, an objective, and rows for every index.",
     )

@@ -6,6 +6,7 @@ A new kind needs an abstract class and three lines here. This module and `regist
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import TypeVar, final
 
 import pluggy
@@ -17,10 +18,17 @@ GROUP = "sparserob"
 
 
 @final
+@dataclass(frozen=True, kw_only=True)
 class ProblemPlugin(
     Plugin, hook="sparserob_problems", component="sparserob_core.control.problem.problem:ProblemFactory"
 ):
-    """A `ProblemFactory`: it makes an optimal control problem or a semi-infinite program from its options."""
+    """A `ProblemFactory`: it makes an optimal control problem or a semi-infinite program from its options.
+
+    ``regularised`` is false where the problem states all of its objective, so that a config without the key
+    ``regulariser`` has none.
+    """
+
+    regularised: bool = True
 
 
 @final

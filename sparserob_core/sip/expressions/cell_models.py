@@ -417,14 +417,19 @@ def _halve(forms: Array) -> Array:
         ],
         axis=1,
     )
-    axes, low, high = variation.argmax(axis=1) + 1, np.empty_like(forms), np.empty_like(forms)
+    axes, halves = variation.argmax(axis=1) + 1, np.empty((2, *forms.shape))
     for axis in range(1, forms.ndim):
         chosen = axes == axis
-        row = np.moveaxis(forms[chosen], axis, -1)
-        first, second = np.empty_like(row), np.empty_like(row)
-        for i in range(row.shape[-1]):
-            first[..., i] = row[..., 0]
-            second[..., second.shape[-1] - 1 - i] = row[..., -1]
-            row = (row[..., :-1] + row[..., 1:]) / 2
-        low[chosen], high[chosen] = np.moveaxis(first, -1, axis), np.moveaxis(second, -1, axis)
-    return np.concatenate([low, high])
+        if chosen.any():
+            lines = np.moveaxis(forms[chosen], axis, -1)
+            for half, matrix in zip(halves, _halving(forms.shape[axis] - 1), strict=True):
+                half[chosen] = np.moveaxis(lines @ matrix.T, -1, axis)
+    return halves.reshape(-1, *forms.shape[1:])
+
+
+@lru_cache(maxsize=16)
+def _halving(degree: int) -> tuple[Array, Array]:
+    """Return the matrices from coefficients of Bernstein's form to those of both halves, whose entries are exact."""
+    rows = [[comb(i, j) / 2**i for j in range(degree + 1)] for i in range(degree + 1)]
+    low = np.array(rows)
+    return low, low[::-1, ::-1].copy()

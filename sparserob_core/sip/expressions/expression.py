@@ -8,7 +8,8 @@ import keyword
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import mul
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
@@ -23,12 +24,37 @@ Evaluation: TypeAlias = Callable[[Mapping[str, Value]], Value]
 
 CONSTANTS = {"pi": math.pi, "e": math.e}
 KEPLER = "kepler"  # the one function of two arguments
+MULTIPLIED = 64  # largest whole power of an object that is multiplied out: ten times as many take as many products
+
+
+def _raise_object(base: Value, exponent: Value) -> Value:
+    """Return a power of a number of another kind: by products where it is whole, for a ball around 0 has no other."""
+    is_whole = isinstance(exponent, float) and exponent.is_integer() and abs(exponent) <= MULTIPLIED
+    if not is_whole or exponent == 0.0:
+        return base**exponent
+    square, count, factors = base, int(abs(exponent)), list[Value]()
+    while count:
+        factors += [square] if count & 1 else []
+        square, count = square * square if count > 1 else square, count >> 1
+    product = reduce(mul, factors)
+    return product if exponent > 0.0 else 1.0 / product
+
+
+_raise_objects = np.frompyfunc(_raise_object, 2, 1)
+
+
+def _raise_to_power(base: Value, exponent: Value) -> Value:
+    """Return a power, entry by entry."""
+    is_object = isinstance(base, np.ndarray) and base.dtype == object
+    return _raise_objects(base, exponent) if is_object else np.power(base, exponent)
+
+
 _OPERATORS: dict[type[ast.operator], Callable[[Value, Value], Value]] = {
     ast.Add: np.add,
     ast.Sub: np.subtract,
     ast.Mult: np.multiply,
     ast.Div: np.true_divide,
-    ast.Pow: np.power,
+    ast.Pow: _raise_to_power,
 }
 _LENGTH, _NODES, _DEPTH = 1000, 400, 40
 

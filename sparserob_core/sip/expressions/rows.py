@@ -12,7 +12,7 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Array, Float, shaped
 from sparserob_core.sip.expressions.cell_models import CellModels, bound_polynomials
-from sparserob_core.sip.expressions.forms import Numbers
+from sparserob_core.sip.expressions.forms import Numbers, Value
 from sparserob_core.sip.expressions.index_sets import Piece, Region
 from sparserob_core.sip.expressions.statements import Decisions, StatedRow, Tables, Words, parse_rows
 from sparserob_core.sip.expressions.taylor import TaylorSpace, taylor_space
@@ -92,8 +92,9 @@ class ExpressionRows:
         values = self.piece.place_columns(indices)
         G = np.zeros((len(indices), len(self.rows), self.words.decisions.n))
         h = np.zeros((len(indices), len(self.rows)))
+        parts: dict[str, Value] = {}
         for i, row in enumerate(self.rows):
-            form = row.form(values)
+            form = row.form(values, parts=parts)
             h[:, i] = -form.constant[:, 0]
             np.add.at(G[:, i].T, form.position, np.broadcast_to(form.coefficient, (len(indices), form.position.size)).T)
             self._require_values(row, indices, np.isfinite(G[:, i]).all(axis=1) & np.isfinite(h[:, i]))
@@ -117,21 +118,27 @@ class ExpressionRows:
         bounds, split = np.full(len(lower), -np.inf), (upper - lower).argmax(axis=1)
         size = max(1, MAX_NUMBERS // (space.products[0].size * (x.size + 1)))
         decision = CellModels.constant(space, x[None])
-        for row in self.rows:
-            for start in range(0, len(lower), size):
-                part = slice(start, start + size)
-                models = self._as_models(row.value(self._variables(space, lower[part], upper[part]), decision), space)
-                over, steepest = bound_polynomials(space, models.coefficients[:, 0], models.remainder[:, 0], 0.0)
-                moves = (upper[part] - lower[part])[np.arange(over.size), steepest] > 0.0
-                split[part] = np.where((over > bounds[part]) & moves, steepest, split[part])
-                bounds[part] = np.maximum(bounds[part], over)
+        for start in range(0, len(lower), size):
+            part, parts = slice(start, start + size), dict[str, Value]()
+            low, high = lower[part], upper[part]
+            variables = self._variables(space, low, high)
+            models = [self._as_models(row.value(variables, decision, parts), space) for row in self.rows]
+            coefficients = [np.broadcast_to(model.coefficients[:, 0], (len(low), space.size)) for model in models]
+            errors = [np.broadcast_to(model.remainder[:, 0], len(low)) for model in models]
+            over, steepest = bound_polynomials(space, np.concatenate(coefficients), np.concatenate(errors), 0.0)
+            over, steepest = over.reshape(-1, len(low)), steepest.reshape(-1, len(low))
+            worst, cells = over.argmax(axis=0), np.arange(len(low))
+            axis = steepest[worst, cells]
+            bounds[part] = over[worst, cells]
+            split[part] = np.where((high - low)[cells, axis] > 0.0, axis, split[part])
         return bounds, split
 
     @shaped
     def violations(self, x: Float[Array, " n"], indices: Float[Array, "k d"]) -> Float[Array, "k r"]:
         """Return the violations of the rows at a decision and at indices."""
         values = self.piece.place_columns(indices)
-        columns = [np.broadcast_to(row.value(values, x[None]), (len(indices), 1)) for row in self.rows]
+        parts: dict[str, Value] = {}
+        columns = [np.broadcast_to(row.value(values, x[None], parts), (len(indices), 1)) for row in self.rows]
         for row, column in zip(self.rows, columns, strict=True):
             self._require_values(row, indices, np.isfinite(column[:, 0]))
         return np.concatenate(columns, axis=1)

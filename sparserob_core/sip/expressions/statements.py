@@ -6,6 +6,7 @@ import ast
 import keyword
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import ClassVar, cast, final
 
 import numpy as np
@@ -31,6 +32,7 @@ SPECIAL = (*FUNCTIONS, *CONSTANTS, KEPLER, CHEBYSHEV, "sum", "range", "abs", "fo
 UNIT = " unit"  # key of the number 1 from which coefficients of the decision are made
 AT = " at"  # key of a decision at which a row is evaluated as a number
 TURNS = " turns"  # key of the number of turns of the sums around an expression; no name of a user has a space
+PARTS = " parts"  # key of the values of parts outside of sums that were evaluated already, by their texts
 MAX_TURNS = 1_000_000  # of all sums around an expression: ten times as many take gigabytes, a tenth refuses long tables
 MAX_WHOLE = 2**53  # beyond it not every whole number is a double
 MAX_DEGREE = 4096  # of a Chebyshev polynomial: ten times as many lose three more digits
@@ -164,12 +166,14 @@ class StatedRow:
     right: Evaluation
     is_equality: bool = False
 
-    def form(self, values: Mapping[str, Value], unit: Value = 1.0) -> AffineForm:
+    def form(self, values: Mapping[str, Value], unit: Value = 1.0, parts: dict[str, Value] | None = None) -> AffineForm:
         """Return ``left - right`` at values of the indices: arrays ``(k, 1)``, or what stands for them.
 
         Coefficients of the decision are multiples of a ``unit``: of a float, or of a number that is never rounded.
+        ``parts`` is shared by the rows of a family that are evaluated at the same values: a part that several of them
+        contain is evaluated once.
         """
-        scope = {**values, TURNS: 1, UNIT: unit}
+        scope = {**values, TURNS: 1, UNIT: unit, PARTS: {} if parts is None else parts}
         with np.errstate(all="ignore"):
             try:
                 form = np.subtract(self.left(scope), self.right(scope))
@@ -179,9 +183,10 @@ class StatedRow:
             raise InputError(f"row {self.text!r}: it is not affine in the decisions")
         return AffineForm.of(form)
 
-    def value(self, values: Mapping[str, Value], x: Value) -> Value:
-        """Return ``left - right`` at values of the indices and a decision ``(1, n)``; the row has a `form`."""
-        scope = {**values, TURNS: 1, AT: x}
+    def value(self, values: Mapping[str, Value], x: Value, parts: dict[str, Value] | None = None) -> Value:
+        """Return ``left - right`` at values of the indices and a decision ``(1, n)``; the row has a `form`. ``parts``
+        is that of `form`, for the same decision."""
+        scope = {**values, TURNS: 1, AT: x, PARTS: {} if parts is None else parts}
         with np.errstate(all="ignore"):
             return np.subtract(self.left(scope), self.right(scope))
 
@@ -252,9 +257,20 @@ class _Statement(Parser):
         super().__init__(text, (*words.decisions.sizes, *words.indices, *words.tables))
 
     def parse(self, node: ast.expr, depth: int) -> Evaluation:
-        if isinstance(node, ast.Subscript):
-            return self.entry(node, depth)
-        return super().parse(node, depth)
+        evaluation = self.entry(node, depth) if isinstance(node, ast.Subscript) else super().parse(node, depth)
+        if self.turning or isinstance(node, ast.Constant | ast.Name):
+            return evaluation
+        text = ast.unparse(node)
+
+        def remember(values: Mapping[str, Value]) -> Value:
+            parts = values.get(PARTS)
+            if parts is None:
+                return evaluation(values)
+            if text not in parts:
+                parts[text] = evaluation(values)
+            return parts[text]
+
+        return remember
 
     def number(self, node: ast.Constant) -> Evaluation:
         value = np.full((1, 1), super().number(node)({}))
@@ -320,13 +336,19 @@ class _Statement(Parser):
         evaluations = [self.whole(place, depth) for place in places]
         text = ast.unparse(node)
 
-        def locate(values: Mapping[str, Value]) -> list[Numbers]:
+        def find(values: Mapping[str, Value]) -> list[Numbers]:
             positions = [np.broadcast_to(evaluate(values), (1, values[TURNS]))[0] for evaluate in evaluations]
             for position, count in zip(positions, shape, strict=True):
                 if position.min(initial=0) < 0 or position.max(initial=0) >= count:
                     outside = position.min() if position.min() < 0 else position.max()
                     raise InputError(f"{text}: expected a number from 0 to {count - 1}, got {outside}")
             return positions
+
+        is_fixed = not any(isinstance(part, ast.Name) for place in places for part in ast.walk(place))
+        find_fixed = lru_cache(maxsize=4)(lambda turns: find({TURNS: turns}))
+
+        def locate(values: Mapping[str, Value]) -> list[Numbers]:
+            return find_fixed(values[TURNS]) if is_fixed else find(values)
 
         if size is not None:
             first = self.words.decisions.positions(name).start
@@ -414,7 +436,7 @@ def _unroll(scope: dict[str, Value], name: str, bounds: Sequence[Numbers]) -> tu
     turned = {
         key: value[:, owner] if isinstance(value, np.ndarray) and value.shape[1] == count and count > 1 else value
         for key, value in scope.items()
-        if key not in (TURNS, AT, UNIT)
+        if key not in (TURNS, AT, UNIT, PARTS)
     }
     variable = np.concatenate([np.asarray(turns, dtype=float) for turns in ranges]) if ranges else np.zeros(0)
     kept = {key: scope[key] for key in (AT, UNIT) if key in scope}

@@ -3,8 +3,9 @@
 The walk of `solve_finite`, each step only where the ones before gave no answer that is believed:
 
 1. `_find_contradiction`: bounds that cross, rows without entries that ask for the impossible.
-2. `_list_cheap_answers`: the optimum without rows, the simplex method for a linear program of very many entries, and
-   Newton's method from a guess (`polish`), or from nothing where it is large, unless a solver was named.
+2. `_list_cheap_answers`: the optimum without rows, the simplex method for a linear program of very many entries or
+   without bounds, and Newton's method from a guess (`polish`), or from nothing where it is large, unless a solver was
+   named. Where the simplex method finds a ray along which the cost falls, the walk ends.
 3. `_solve_in_new_variables`: the program in other variables, where that makes it easier (`change_of_variables`), solved
    by this walk.
 4. `_try_forms`: the program in the form that a solver takes (`standard_form`), form after form and accuracy after
@@ -77,7 +78,8 @@ class _Case:
     ``best`` is the best answer that is not believed; ``attempts`` says why each was not believed. ``blunt`` is the best
     believed answer that is not sharp. ``crude``: the fault of the solver's own answer, where Newton's method turned it
     into one that holds. ``lost``: how often in a row the solver has neither solved a program nor called it infeasible.
-    ``elastic``: whether the elastic program was asked. ``small``: see `solve_finite`.
+    ``elastic``: whether the elastic program was asked. ``falls``: whether the simplex method
+    found a ray along which the cost falls without bound. ``small``: see `solve_finite`.
     """
 
     program: FiniteProgram
@@ -88,6 +90,7 @@ class _Case:
     best: FiniteSolution | None = None
     blunt: FiniteSolution | None = None
     elastic: bool = False
+    falls: bool = False
     crude: str = ""
     lost: int = 0
 
@@ -200,6 +203,8 @@ def _solve_case(case: _Case, guess: FiniteSolution | None) -> FiniteSolution:
         believed = case.judge(solution, "without a solver", by)
         if believed is not None:
             return believed
+    if case.falls:
+        return _report_failure(case)
     case.attempts.clear()
     if program.blocks is not None and program.S is None:
         return _solve_by_directions(case, program.blocks, guess)
@@ -391,19 +396,23 @@ def _solve_by_simplex(case: _Case) -> FiniteSolution | None:
     """Return the answer of the simplex method to a linear program, if it is believed and sharp. An interior-point
     method may lack digits, as with rows that are nearly parallel, or go in circles; a vertex is a system of equations.
     Nothing where a solver was named."""
-    for solution in _list_corners(case.program) if HIGHS in case.solver.quick else ():
+    for solution in _list_corners(case) if HIGHS in case.solver.quick else ():
         believed = case.judge(solution, "a vertex", HIGHS)
         if believed is not None:
             return believed
     return None
 
 
-def _list_corners(program: FiniteProgram) -> Iterator[FiniteSolution]:
+def _list_corners(case: _Case) -> Iterator[FiniteSolution]:
     """Yield the vertex of the simplex method with its multipliers, and with those of the vertex; of a program that is
     not linear, none."""
+    program = case.program
     if program.P is not None or program.blocks is not None:
         return
     corner = simplex(program, TURNS * (program.n + program.h.size + program.b.size))
+    if corner.status == "unbounded":
+        case.falls = True
+        case.attempts.append("the simplex method: the cost falls without bound")
     if corner.status != "optimal":
         return
     yield measure(program, corner.x, corner.y, corner.mu, corner.z, message="simplex method")
@@ -482,7 +491,7 @@ def _list_cheap_answers(case: _Case, guess: FiniteSolution | None) -> Iterator[t
             zero, none = np.zeros(program.h.size), np.zeros(program.b.size)
             yield CLOSED_FORM, measure(program, x, zero, none, message="no row is active")
     if HIGHS in quick and program.S is None and not program.bounded:  # where others take long, and a vertex is exact
-        yield from ((HIGHS, solution) for solution in _list_corners(program))
+        yield from ((HIGHS, solution) for solution in _list_corners(case))
     if HIGHS in quick and many(program):
         corner = sifted(program, *((None, None) if guess is None else (guess.y, guess.mu)))
         if corner.status == "optimal":

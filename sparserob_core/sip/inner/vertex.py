@@ -19,6 +19,7 @@ ACCURACY = 1e-10  # the finest that the simplex method offers
 MANY = 5000  # entries of a separable program from which most are left out of the simplex method
 NEAREST = 1000  # of them, those that it begins with; or a share of them
 SHARE = 0.05
+UNSOLVED: dict[int, Literal["infeasible", "unbounded"]] = {2: "infeasible", 3: "unbounded"}  # scipy's numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +30,7 @@ class Corner:
     image is ``x`` itself or no multipliers are known.
     """
 
-    status: Literal["optimal", "infeasible", "failed"]
+    status: Literal["optimal", "infeasible", "unbounded", "failed"]
     x: Array
     y: Array
     mu: Array
@@ -146,7 +147,7 @@ def simplex(program: FiniteProgram, turns: int | None = None) -> Corner:
     )
     if answer.status != 0 or answer.x is None:
         none = np.zeros(0)
-        return Corner("infeasible" if answer.status == 2 else "failed", none, none, none)
+        return Corner(UNSOLVED.get(answer.status, "failed"), none, none, none)
     y = -np.asarray(answer.ineqlin.marginals) if r else np.zeros(0)
     mu = -np.asarray(answer.eqlin.marginals)[-program.b.size :] if program.b.size else np.zeros(0)
     if program.S is None:

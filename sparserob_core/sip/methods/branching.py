@@ -149,7 +149,7 @@ class Branching:
             z = None if z is None else z / size
             dual = self._make_dual(finite, y / size, mu / size, z, amount, False)
             return replace(part, bound=np.inf, x=None), Leaf(dual, feasible=False)
-        if corner.status == "failed":
+        if corner.status != "optimal":
             return fallback, leaf
         candidates = [(y, mu, z), (np.zeros_like(y), np.zeros_like(mu), None)]
         bounds = [proving(finite, *candidate) for candidate in candidates]
@@ -166,7 +166,7 @@ class Branching:
             answer = self.relaxed.answered(finite)
             return Corner(answer.status, answer.x, answer.y, answer.mu, None if finite.S is None else answer.z)
         corner = simplex(finite)
-        self.relaxed.count(NOBODY if corner.status == "failed" else HIGHS)
+        self.relaxed.count(HIGHS if corner.status in ("optimal", "infeasible") else NOBODY)
         return _find_infeasibility(finite) if corner.status == "infeasible" else corner
 
     def _make_dual(

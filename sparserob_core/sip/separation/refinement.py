@@ -26,6 +26,13 @@ HOPELESS = 8.0
 """Times the variation of a model by which its maximum may lie above its best point. With an eighth of it narrow peaks
 are given up; with ten times as much nothing is."""
 MAX_DIMENSION_WITH_CROSS_TERMS = 8
+# Where `surround` measures curvatures, and how far at most it goes, in sides of the unit box. With a tenth of the
+# first, curvatures of rows that are nearly straight are rounding; ten times as much spans several peaks. A quarter of
+# the second takes more rounds where rows are straight; with four times as much all points are outside of the box.
+MEASURED, FARTHEST = 1e-3, 0.25
+# Of the distance from a maximum to where its row is kept, where the points around it are: with a fifth of it they say
+# little that the maximum does not, and with twice as much they are not violated.
+SURROUNDING = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +105,23 @@ def refine(function: VectorFunction, candidates: Candidates, least: float = -np.
         if active.size == 0:
             break
     return replace(candidates, points=points, values=values, radius=radius)
+
+
+def surround(function: VectorFunction, maxima: Candidates) -> Candidates:
+    """Return points on both sides of every maximum ``(c, d)`` of positive value, along the axes of its curvature, where
+    about three quarters of its value are left."""
+    dimension = maxima.points.shape[1]
+    offsets = _build_stencil(dimension)
+    middle = np.clip(maxima.points, MEASURED, 1.0 - MEASURED)
+    values = _evaluate_points(function, inside(middle[:, np.newaxis] + MEASURED * offsets), maxima.rows)
+    curvature, axes = np.linalg.eigh(_fit_models(middle, values, offsets).hessian / MEASURED**2)
+    fall = 2.0 * SURROUNDING**2 * maxima.values[:, np.newaxis]
+    steps = np.sqrt(fall / np.maximum(-curvature, fall / FARTHEST**2))[:, np.newaxis] * axes  # an axis in each column
+    middle = np.repeat(maxima.points, 2 * dimension, axis=0)
+    points = inside(middle + np.concatenate([steps, -steps], axis=2).transpose(0, 2, 1).reshape(-1, dimension))
+    rows = np.repeat(maxima.rows, 2 * dimension)
+    values = _evaluate_points(function, points[:, np.newaxis], rows)[:, 0]
+    return Candidates(points, rows, values, np.full(rows.size, MEASURED))
 
 
 def _take_step(

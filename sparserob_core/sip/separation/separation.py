@@ -124,8 +124,17 @@ class _ViolationSearch:
         return self.found.values
 
     def result(self) -> Separation:
-        """Return the worst distinct maxima found so far, with the bound."""
+        """Return the worst distinct maxima found so far, with the bound.
+
+        As many rows as the decision has variables may be active. Where fewer maxima are violated, several active rows
+        are near one of them, so that points around every maximum are returned too.
+        """
+        from sparserob_core.sip.separation.refinement import surround
+
         worst = _select_distinct(self.found, self.kept)
+        violated = (worst.values > self.threshold) & (worst.values < np.inf)
+        if self.field.dimension and 0 < violated.sum() < self.field.x.size:
+            worst = _sort_worst_first(worst.join(surround(self.field, worst.take(violated))))
         return Separation(self.field.indices(worst.points), worst.rows, worst.values, self.bound)
 
     def look_closer(self) -> None:
@@ -247,7 +256,7 @@ def _choose_grid_side(dimension: int, most: int) -> int:
 
 def _select_distinct(found: Candidates, kept: int) -> Candidates:
     """Worst first; of every row at most so many maxima, each once."""
-    found = found.take(np.argsort(-found.values, kind="stable"))
+    found = _sort_worst_first(found)
     chosen = np.zeros(found.rows.size, dtype=bool)
     for row in np.unique(found.rows):
         positions = np.flatnonzero(found.rows == row)[: MAXIMA_PER_KEPT * kept]
@@ -255,3 +264,7 @@ def _select_distinct(found: Candidates, kept: int) -> Candidates:
         near = np.abs(points[:, np.newaxis] - points).max(axis=2, initial=0.0) <= SAME
         chosen[positions[~np.tril(near, -1).any(axis=1)][:kept]] = True
     return found.take(chosen)
+
+
+def _sort_worst_first(found: Candidates) -> Candidates:
+    return found.take(np.argsort(-found.values, kind="stable"))

@@ -189,8 +189,8 @@ def _collect_rows(
     rows = rows_of(recession, chosen)
     for number in range(ROUNDS):
         tools.deadline.check()
-        base = recession.finite
-        corner = simplex(replace(base, G=np.vstack([base.G, rows.G]), h=np.concatenate([base.h, rows.h])))
+        base, G = recession.finite, np.unique(rows.G, axis=0)  # rows that differ on the right alone are the same here
+        corner = simplex(replace(base, G=np.vstack([base.G, G]), h=np.concatenate([base.h, np.zeros(len(G))])))
         if corner.status != "optimal":
             return chosen, False
         if recession.cost(corner.x) >= -fall:
@@ -207,9 +207,9 @@ def _collect_rows(
 def complete_multipliers(program: SemiInfiniteProgram, dual: Dual, is_priced: bool) -> Dual:
     """Return multipliers that can be moved so that every entry without bounds has exactly the slope that it needs.
 
-    As many of them as there are such entries have to be positive, and their rows independent. Where they are fewer,
-    small multiples of a positive combination of rows and the cost are added, in which those entries cancel
-    (`balance_rows`). The bound then loses the share `SPENT` of itself.
+    As many of them as there are such entries have to be positive by more than rounding, and their rows independent.
+    Where they are fewer, small multiples of a positive combination of rows and the cost are added, in which those
+    entries cancel (`balance_rows`). The bound then loses the share `SPENT` of itself.
 
     Parameters
     ----------
@@ -226,7 +226,9 @@ def complete_multipliers(program: SemiInfiniteProgram, dual: Dual, is_priced: bo
         return dual
     own_cuts = sorted(dual.cuts, key=lambda cut: cut.family)
     own, fixed = rows_of(program, _group_by_family(own_cuts)), dual.of_fixed_rows(base.h.size)
-    used = np.vstack([own.G, base.G[fixed > 0.0], base.A])[:, free]
+    multipliers = np.array([cut.multiplier for cut in own_cuts])
+    least = SPENT * max(multipliers.max(initial=0.0), fixed.max(initial=0.0))
+    used = np.vstack([own.G[multipliers > least], base.G[fixed > least], base.A])[:, free]
     if np.linalg.matrix_rank(used) == int(free.sum()):
         return dual
     rows = own.joined(rows_of(program, first_rows(program)))
@@ -240,11 +242,11 @@ def complete_multipliers(program: SemiInfiniteProgram, dual: Dual, is_priced: bo
     if combination is None:
         return dual
     added, moved, factor = combination
-    size = abs(dual.bound) if is_priced else float(sum(cut.multiplier for cut in dual.cuts))
+    size = abs(dual.bound) if is_priced else float(multipliers.sum())
     loss = float(np.abs(added) @ np.abs(right) + np.abs(moved) @ np.abs(base.b)) or 1.0
     share = SPENT * (size or 1.0) / loss
     kept = 1.0 - share * factor
-    y = kept * np.concatenate([[cut.multiplier for cut in own_cuts], np.zeros(rows.h.size - own.h.size)])
+    y = kept * np.concatenate([multipliers, np.zeros(rows.h.size - own.h.size)])
     y = y + share * added[: rows.h.size]
     fixed = kept * fixed
     fixed[finite] += share * added[rows.h.size :]

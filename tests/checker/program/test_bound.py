@@ -11,7 +11,7 @@ from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.program import bound
 from sparserob_core.checker.program.bound import Lagrangian, row_of_term
 from sparserob_core.sip.stated.statement import StatedProgram
-from tests.support.stated import state
+from tests.support.stated import certify, judge, state
 
 UP = (None, 0.0)  # a single entry that is not negative
 
@@ -205,3 +205,20 @@ def test_large_sums_that_may_vanish_are_not_judged(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(bound, "MAX_EXACT", 1)
     with pytest.raises(Unchecked, match="more than 1 entries"):
         lagrangian.require_convex()
+
+
+def test_corrections_after_corrections_lose_no_digits() -> None:
+    """Least absolute deviations of a rising polynomial: at the optimum many residuals have a slope that is exactly
+    their weight. A correction moves another one beyond it by rounding, and so on."""
+    program = state(
+        {"a": 6},
+        "sum(abs(sum(a[k]*t[i]^k for k in range(6)) - y[i]) for i in range(11))",
+        "sum(k*a[k]*x^(k - 1) for k in range(1, 6)) >= 0",
+        index={"x": (0.0, 1.0)},
+        tables={
+            "t": [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1],
+            "y": [0.02, 0.25, 0.21, 0.18, 0.24, 0.21, 0.46, 0.83, 0.79, 0.75, 0.93],
+        },
+    )
+    findings = judge(program, certify(program))
+    assert [found.name for found in findings.values() if found.verdict != "holds"] == []

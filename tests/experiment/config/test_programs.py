@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
+from sparserob_core.experiment.config.load import load_config
 from tests.support.stub import Command
 
 PROGRAM: dict[str, Any] = {
@@ -36,7 +37,7 @@ def write(folder: Path, path: str = "", value: object = None) -> str:
         holder = holder[key]
     if path:
         holder[last] = value
-    (folder / "program.yaml").write_text(yaml.safe_dump({"problem": problem, "regulariser": None}))
+    (folder / "program.yaml").write_text(yaml.safe_dump({"problem": problem}))
     return "program.yaml"
 
 
@@ -119,8 +120,20 @@ def test_a_forged_result_of_a_program_is_refuted_by_status_4(command: Command, t
         assert done.returncode == 4 and "fails" in done.stdout and "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize(("given", "expected"), [(None, None), ("ridge", {"name": "ridge"}), ("", None)])
+def test_a_program_has_no_regulariser_but_the_one_that_is_given(given: str | None, expected: object) -> None:
+    config = {"problem": PROGRAM} if given == "" else {"problem": PROGRAM, "regulariser": given}
+    assert load_config(config).config.plain()["regulariser"] == expected
+
+
+def test_a_control_problem_keeps_its_regulariser_and_an_override_wins() -> None:
+    system = {"A": [[0.0]], "B": [[1.0]]}
+    problem = {"name": "linear", "system": system, "horizon": 1.0, "initial_state": [1.0], "control": {"box": 1.0}}
+    assert load_config({"problem": problem}).config.plain()["regulariser"] == {"name": "ridge"}
+    assert load_config({"problem": PROGRAM}, ["regulariser=ridge"]).config.plain()["regulariser"] == {"name": "ridge"}
+
+
 def test_a_study_of_programs_runs_over_tables_and_bounds(command: Command, tmp_path: Path) -> None:
-    """A complete config says ``regulariser: null``, and each point has one."""
     config = write(tmp_path)
     done = command("sweep", config, "problem.decision.d.upper=5,0.01", "--out", "bounds")
     assert done.returncode == 0 and "certified" in done.stdout and "infeasible" in done.stdout

@@ -351,3 +351,18 @@ def test_the_coordinate_to_halve_is_the_one_along_which_the_polynomial_varies(co
     coefficients = np.zeros((1, space.size))
     coefficients[0, space.index[tuple(np.eye(2, dtype=int)[coordinate].tolist())]] = 1.0
     assert bound_polynomials(space, coefficients, np.zeros(1), 0.0)[1].tolist() == [coordinate]
+
+
+@pytest.mark.parametrize("degree", [1, 4, 10])
+def test_both_halves_of_a_form_are_the_form_to_the_last_digits(degree: int) -> None:
+    """At its ends, of every order: a coefficient that is a little wrong is seen there."""
+    low, high = cell_models._halving(degree)
+    points = np.array([Fraction(k, degree) if degree else Fraction(0) for k in range(degree + 1)], dtype=object)
+
+    def values(t: np.ndarray) -> np.ndarray:
+        """The Bernstein polynomials at exact points."""
+        return np.array([[comb(degree, k) * s**k * (1 - s) ** (degree - k) for k in range(degree + 1)] for s in t])
+
+    exact = np.vectorize(Fraction, otypes=[object])
+    assert (values(points) @ exact(low) == values(points / 2)).all()
+    assert (values(points) @ exact(high) == values((points + 1) / 2)).all()

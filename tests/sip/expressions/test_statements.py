@@ -6,8 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from flint import arb
 
 from sparserob_core.errors import InputError
+from sparserob_core.sip.expressions.elementary import FUNCTIONS
 from sparserob_core.sip.expressions.rows import ExpressionRows
 from sparserob_core.sip.expressions.statements import (
     Decisions,
@@ -359,3 +361,40 @@ def test_other_objectives_are_refused(text: str, part: str) -> None:
     with pytest.raises(InputError) as caught:
         parse_cost(text, Words(DECISIONS, (), TABLES))
     assert part in str(caught.value) and repr(text) in str(caught.value)
+
+
+def test_a_part_that_several_rows_contain_is_evaluated_once_and_stays_what_it_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shared, calls = "exp(w)*sum(a[k]*w^k*c[1] for k in range(4)) + v*x", []
+
+    def count(values: np.ndarray) -> np.ndarray:
+        calls.append(values)
+        return np.exp(values)
+
+    monkeypatch.setitem(FUNCTIONS, "exp", count)
+    texts = [f"{shared} <= 1", f"{shared} >= v - 2", f"-2 <= {shared} <= 3", f"2*({shared}) - 3*w <= x"]
+    G, h = parse(*texts).evaluate(POINTS)
+    alone = [parse(text) for text in texts]
+    assert np.array_equal(G, np.concatenate([rows.evaluate(POINTS)[0] for rows in alone], axis=1))
+    assert np.array_equal(h, np.concatenate([rows.evaluate(POINTS)[1] for rows in alone], axis=1))
+    family = parse(*texts)
+    calls.clear()
+    violations = family.violations(DECISION, POINTS)
+    assert len(calls) == 1
+    assert np.array_equal(violations, np.concatenate([rows.violations(DECISION, POINTS) for rows in alone], axis=1))
+    calls.clear()
+    family.evaluate(POINTS)
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize("power", [2.0, 3.0, -2.0, 64.0])
+def test_a_power_of_a_ball_around_0_is_a_product(power: float) -> None:
+    around = np.array([[arb(0.0, 1e-3), arb(0.5, 1e-9), arb(-2.0)]], dtype=object)
+    words = Words(Decisions({"x": None}), ("t",))
+    row = parse_rows(f"t^{power:g} <= x", words)[0]
+    values = row.value({"t": around[:, 1:]}, np.array([[arb(0.0)]], dtype=object))[0]
+    assert all(value.contains(point**power) for value, point in zip(values, (arb(0.5), arb(-2.0)), strict=True))
+    if power > 0.0:
+        value = row.value({"t": around[:, :1]}, np.array([[arb(0.0)]], dtype=object))[0, 0]
+        assert value.is_finite() and value.contains(arb(1e-3) ** int(power))

@@ -286,3 +286,48 @@ def test_all_peaks_are_refined_in_few_batches():
 
     worst(waves, [0.0], [1.0])
     assert len(calls) <= 40
+
+
+def search_with(variables, violation, lower, upper):
+    """Return what is found for a decision of so many variables, of which the first one alone has coefficients."""
+    made_up = family(violation, lower, upper)
+
+    def rows(indices):
+        G, h = made_up.rows(indices)
+        return np.concatenate([G, np.zeros((*G.shape[:2], variables - 1))], axis=2), h
+
+    return search_worst(replace(made_up, rows=rows), np.eye(variables)[0], tools())
+
+
+def test_points_around_a_maximum_are_returned_where_there_are_fewer_maxima_than_variables():
+    """Along the axes of its curvature, where three quarters of the violation are left; none beyond the index set."""
+    turned = np.array([[0.8, 0.6], [-0.6, 0.8]])
+    curvature = turned @ np.diag([30.0, 400.0]) @ turned.T
+    peak = np.array([1.3, -0.2])
+
+    def violation(s):
+        return 0.5 - 0.5 * np.einsum("ki,ij,kj->k", s - peak, curvature, s - peak)
+
+    found = search_with(5, violation, [0.0, -1.0], [2.0, 1.0])
+    assert found.violations == pytest.approx([0.5, *[0.375] * 4], rel=1e-3)
+    assert np.allclose(found.indices[0], peak, atol=1e-6)
+    steps = (found.indices[1:] - found.indices[0]) @ turned
+    lengths = 0.5 * np.sqrt(2 * 0.5 / np.array([30.0, 400.0]))
+    expected = np.concatenate([np.diag(lengths), -np.diag(lengths)])
+    assert all(np.abs(steps - step).max(axis=1).min() <= 1e-3 for step in expected)
+    shift = np.array([0.0, 0.8])
+    beyond = search_with(5, lambda s: violation(s + shift), [0.0, -1.0], [2.0, 1.0])  # the peak is on a face
+    assert (beyond.indices >= [0.0, -1.0]).all() and len(beyond.indices) == 5
+    assert beyond.violations == pytest.approx(violation(beyond.indices + shift), abs=1e-12)
+
+
+def test_maxima_alone_are_returned_where_they_are_as_many_as_variables_or_none_is_violated():
+    waves = search_with(3, lambda s: np.cos(2 * np.pi * s[:, 0]), [0.0], [2.0])
+    assert np.sort(waves.indices[:, 0]) == pytest.approx([0.0, 1.0, 2.0], abs=1e-9)
+    kept = search_with(7, lambda s: np.cos(2 * np.pi * s[:, 0]) - 2.0, [0.0], [2.0])
+    assert np.sort(kept.indices[:, 0]) == pytest.approx([0.0, 1.0, 2.0], abs=1e-9)
+
+
+def test_a_row_that_is_nearly_straight_is_surrounded_within_a_quarter_of_its_box():
+    flat = search_with(2, lambda s: 1.0 - 1e-9 * s[:, 0] ** 2, [-1.0], [1.0])
+    assert np.sort(flat.indices[:, 0]) == pytest.approx([-0.5, 0.0, 0.5], abs=1e-4)

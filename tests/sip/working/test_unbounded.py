@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.inner.duality import balance_rows
+from sparserob_core.sip.relaxed.relaxed import rows_of
 from sparserob_core.sip.working import unbounded
 from tests.support.oscillating import PROGRAMS
 
@@ -95,3 +97,36 @@ def test_rows_that_bound_a_program_have_a_positive_combination_with_its_cost():
     assert balance_rows(rows[:1], np.zeros((0, 2)), cost) is None
     y, mu, factor = balance_rows(rows[:1], np.array([[1.0, 0.0]]), cost)
     assert np.abs(y @ rows[:1] + mu @ np.array([[1.0, 0.0]]) + factor * cost).max() <= 1e-9
+
+
+def test_multipliers_of_fewer_rows_than_free_variables_are_joined_by_others_with_the_cost():
+    """The largest ``x + 0.3 y`` below one parabola: one row is active, no rows alone cancel, since all of them bound
+    ``x`` from one side, and a multiplier that is rounding is none."""
+    family = sr.ConstraintFamily.from_expressions(
+        "below", index={"t": (-1, 1)}, rows=["x + y*t <= 3 + (t - 0.3)^2"], decision={"x": None, "y": None}
+    )
+    program = sr.SemiInfiniteProgram(n=2, q=[-1.0, -0.3], families=[family])
+    for noise in ((), (Cut("below", np.array([-0.7]), 0, multiplier=1e-15),)):
+        dual = Dual(bound=-3.0, cuts=(Cut("below", np.array([0.3]), 0, multiplier=1.0), *noise), mu=np.zeros(0))
+        full = unbounded.complete_multipliers(program, dual, True)
+        rows = rows_of(program, [(cut.index[None], np.array([cut.row]), cut.family) for cut in full.cuts])
+        y = np.array([cut.multiplier for cut in full.cuts])
+        assert (y > 0.0).all() and np.linalg.matrix_rank(rows.G[y > 1e-14]) == 2
+        assert program.finite.q + y @ rows.G == pytest.approx([0.0, 0.0], abs=3e-15)
+        assert -y @ rows.h == pytest.approx(-3.0, rel=1e-11)
+
+
+def test_three_coordinates_take_few_rounds_and_no_solver_is_asked_for_an_unbounded_program():
+    """The option of the test above, as text, with a proof."""
+    quadratic = "a[0]*x^2+a[1]*x*y+a[2]*x*z+a[3]*y^2+a[4]*y*z+a[5]*z^2+a[6]*x+a[7]*y+a[8]*z+a[9]"
+    family = sr.ConstraintFamily.from_expressions(
+        "payoff",
+        index=dict.fromkeys("xyz", (-400, 400)),
+        rows=[f"{quadratic} >= {payoff}" for payoff in ("0", "x - 40", "y - 40", "z - 40")],
+        decision={"a": 10},
+    )
+    mean, square, product = 44.21, 2138.5641, 2119.4041
+    moments = [square, product, product, square, product, square, mean, mean, mean, 1.0]
+    result = sr.solve(sr.SemiInfiniteProgram(n=10, q=moments, families=[family]))
+    assert result.status == "certified" and result.cost == pytest.approx(13.2036941, rel=1e-7)
+    assert result.counts["rounds"] <= 25 and result.counts["solver_calls"] == 0
