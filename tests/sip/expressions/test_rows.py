@@ -85,7 +85,18 @@ def test_a_violation_of_a_single_point_is_above_every_bound_of_its_cell() -> Non
 
 @pytest.mark.parametrize(
     "text",
-    ["log(t)", "sqrt(t - 0.4)", "1/t", "t**-1", "t**-0.5", "t**t", "log(t - 0.4)", "1/(t - 0.3)", "tan(2*t)", "log(0.9 - t)"],
+    [
+        "log(t)",
+        "sqrt(t - 0.4)",
+        "1/t",
+        "t**-1",
+        "t**-0.5",
+        "t**t",
+        "log(t - 0.4)",
+        "1/(t - 0.3)",
+        "tan(2*t)",
+        "log(0.9 - t)",
+    ],
 )
 def test_a_row_without_an_enclosure_has_an_infinite_bound_and_no_other_row_has(text: str) -> None:
     for row in (f"x*({text}) <= 1", f"{text} <= x", f"x + {text} >= 0"):
