@@ -13,7 +13,7 @@ import numpy as np
 from flint import arb
 
 from sparserob_core.checker.arithmetic.balls import ball, rational
-from sparserob_core.checker.arithmetic.models import Frame, Model
+from sparserob_core.checker.arithmetic.models import Frame, Model, find_highest, measure_steepness
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.sip.convex_set import Array
@@ -84,7 +84,7 @@ def _bound_cell(
     except (Unchecked, ValueError, ZeroDivisionError):
         return np.inf, shares
     model = violation if isinstance(violation, Model) else frame.number(arb(violation))
-    bound, steepness = model.highest(), model.steepness()
+    bound, steepness = find_highest(model), measure_steepness(model)
     is_known = np.isfinite(bound) and (steepness[shares > 0.0] > 0.0).any()
     return bound, np.where(shares > 0.0, steepness, -1.0) if is_known else shares
 
