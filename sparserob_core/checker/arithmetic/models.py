@@ -151,47 +151,8 @@ class Model:
                     power = power * base
                 return power if count >= 0 else 1.0 / power
         if isinstance(other, int | float | np.integer | np.floating) and not float(other).is_integer() and other > 0:
-            return self._raise_to_fraction(float(other))
+            return _raise_to_fraction(self, float(other))
         return (self._convert_to_model(other) * self.log()).exp()
-
-    def _raise_to_fraction(self, power: float) -> Model:
-        """Return a positive power that is no whole number. Where values reach down to 0, it is the chord from 0 to the
-        largest value, with the largest distance between the two on one side. Values down to `NEGATIVE` count as 0."""
-        try:
-            return (self.frame.number(ball(power)) * self.log()).exp()
-        except Unchecked:
-            below, top = max((-self).highest(), 0.0), self.size.upper()
-            if not (top > 0 and top.is_finite() and below <= NEGATIVE):
-                raise
-        exponent = ball(power)
-        slope, share = top ** (exponent - 1), exponent ** (1 / (1 - exponent))
-        half = abs(share**exponent - share) * top**exponent / 2
-        chord = self * self.frame.number(slope) + self.frame.number(half if power < 1.0 else -half)
-        return chord._truncate(half + slope * ball(below))
-
-    def highest(self) -> float:
-        """Return an upper bound of the model at every time and parameter, by Bernstein's form; infinite where there is
-        none."""
-        variables, degree = self.frame.monomials.count, self.frame.monomials.degree
-        coefficients, error = np.zeros((self.frame.order + 1, *([degree + 1] * variables))), arb(0)
-        for exponents, part in zip(self.frame.monomials.exponents, self.parts, strict=True):
-            for power, coefficient in enumerate([] if part is None else part.coeffs()):
-                middle = float(coefficient.mid())
-                coefficients[(power, *exponents)] = middle
-                error = error + abs(coefficient - middle)
-        remainder = above(error)
-        if not np.isfinite(coefficients).all() or not np.isfinite(remainder):
-            return np.inf
-        return float(highest(coefficients[None], [True] * (variables + 1), np.array([remainder]), 0.0)[0])
-
-    def steepness(self) -> Array:
-        """Return how much the model changes, at most and without its remainder, along the time and each parameter."""
-        changes = np.zeros(self.frame.monomials.count + 1)
-        for exponents, part in zip(self.frame.monomials.exponents, self.parts, strict=True):
-            sizes = [abs(float(coefficient.mid())) for coefficient in ([] if part is None else part.coeffs())]
-            changes[0] += sum(power * size for power, size in enumerate(sizes))
-            changes[1:] += sum(sizes) * np.array(exponents, dtype=float)
-        return changes
 
     def __rpow__(self, other: object) -> Model:
         return self._convert_to_model(other) ** self
@@ -242,7 +203,7 @@ class Model:
         try:
             return self._apply_function(lambda s: s.sqrt())
         except Unchecked:
-            return self._raise_to_fraction(0.5)
+            return _raise_to_fraction(self, 0.5)
 
     def tanh(self) -> Model:
         return self._apply_function(lambda s: _expand_tangent(s, s[0].tanh(), s[0].sech() ** 2, -1))
@@ -262,6 +223,54 @@ def _sum_powers(coefficients: Sequence[arb], model: Model) -> Model:
     for coefficient in reversed(coefficients[:-1]):
         total = total * model + frame.number(coefficient)
     return total
+
+
+def _raise_to_fraction(model: Model, power: float) -> Model:
+    """Return a positive power that is no whole number. Where values reach down to 0, it is the chord from 0 to the
+    largest value, with the largest distance between the two on one side. Values down to `NEGATIVE` count as 0."""
+    try:
+        return (model.frame.number(ball(power)) * model.log()).exp()
+    except Unchecked:
+        below, top = max(find_highest(-model), 0.0), model.size.upper()
+        if not (top > 0 and top.is_finite() and below <= NEGATIVE):
+            raise
+    exponent = ball(power)
+    slope, share = top ** (exponent - 1), exponent ** (1 / (1 - exponent))
+    half = abs(share**exponent - share) * top**exponent / 2
+    chord = model * model.frame.number(slope) + model.frame.number(half if power < 1.0 else -half)
+    return chord._truncate(half + slope * ball(below))
+
+
+def find_highest(model: Model) -> float:
+    """Return an upper bound of a model at every time and parameter, by Bernstein's form; infinite where there is
+    none."""
+    coefficients, remainder = separate_errors(model)
+    if not np.isfinite(coefficients).all() or not np.isfinite(remainder):
+        return np.inf
+    return float(highest(coefficients[None], [True] * coefficients.ndim, np.array([remainder]), 0.0)[0])
+
+
+def separate_errors(model: Model) -> tuple[Array, float]:
+    """Return the middles of the coefficients of a model, an axis for the time and each parameter, and a bound of what
+    they leave out."""
+    variables, degree = model.frame.monomials.count, model.frame.monomials.degree
+    coefficients, error = np.zeros((model.frame.order + 1, *([degree + 1] * variables))), arb(0)
+    for exponents, part in zip(model.frame.monomials.exponents, model.parts, strict=True):
+        for power, coefficient in enumerate([] if part is None else part.coeffs()):
+            middle = float(coefficient.mid())
+            coefficients[(power, *exponents)] = middle
+            error = error + abs(coefficient - middle)
+    return coefficients, above(error)
+
+
+def measure_steepness(model: Model) -> Array:
+    """Return how much a model changes, at most and without its remainder, along the time and each parameter."""
+    changes = np.zeros(model.frame.monomials.count + 1)
+    for exponents, part in zip(model.frame.monomials.exponents, model.parts, strict=True):
+        sizes = [abs(float(coefficient.mid())) for coefficient in ([] if part is None else part.coeffs())]
+        changes[0] += sum(power * size for power, size in enumerate(sizes))
+        changes[1:] += sum(sizes) * np.array(exponents, dtype=float)
+    return changes
 
 
 def _bound_polynomial(part: arb_poly) -> arb:

@@ -72,7 +72,7 @@ def _require_dimension(simplices: Sequence[Sequence[Point]], rows: Sequence[Row]
     equalities = [
         normal
         for normal, side in rows
-        if any(side == -opposite and normal == [-value for value in other] for other, opposite in rows)
+        if any(side == -end and normal == [-value for value in opposite] for opposite, end in rows)
     ]
     count = _rank((Fraction(0),) * dimension, equalities) if equalities else 0
     if size != dimension - count:

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 import numpy as np
 from flint import arb
 
-from sparserob_core.checker.arithmetic.balls import above, ball, rational
+from sparserob_core.checker.arithmetic.balls import ball, rational
 from sparserob_core.checker.arithmetic.bernstein import highest
-from sparserob_core.checker.arithmetic.models import Frame, Model
+from sparserob_core.checker.arithmetic.models import Frame, Model, measure_steepness, separate_errors
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.sip.convex_set import Array
@@ -89,7 +89,7 @@ def _bound_cell(
         except (Unchecked, ValueError, ZeroDivisionError):
             violation = arb(np.inf)
         models.append(violation if isinstance(violation, Model) else frame.number(arb(violation)))
-    tables, errors = zip(*(_separate_errors(frame, model) for model in models), strict=True)
+    tables, errors = zip(*map(separate_errors, models), strict=True)
     return highest(np.array(tables), [True] * lower.size, np.array(errors), 0.0), models
 
 
@@ -98,22 +98,9 @@ def _choose_axis(rows: ExpressionRows, bounds: Array, models: list[Model], lower
     part of the side of the box, where that is unknown."""
     shares = (upper - lower) / np.maximum(rows.upper - rows.lower, np.finfo(float).tiny)
     worst = int(bounds.argmax())
-    steepness = models[worst].steepness() if np.isfinite(bounds[worst]) else np.zeros(lower.size)
+    steepness = measure_steepness(models[worst]) if np.isfinite(bounds[worst]) else np.zeros(lower.size)
     is_known = bool((steepness[shares > 0.0] > 0.0).any())
     return int((np.where(shares > 0.0, steepness, -1.0) if is_known else shares).argmax())
-
-
-def _separate_errors(frame: Frame, model: Model) -> tuple[Array, float]:
-    """Return the middles of the coefficients of a model, and a bound of what they leave out."""
-    variables, degree = frame.monomials.count, frame.monomials.degree
-    coefficients = np.zeros((frame.order + 1, *([degree + 1] * variables)))
-    error = arb(0)
-    for exponents, part in zip(frame.monomials.exponents, model.parts, strict=True):
-        for power, coefficient in enumerate([] if part is None else part.coeffs()):
-            middle = float(coefficient.mid())
-            coefficients[(power, *exponents)] = middle
-            error = error + abs(coefficient - middle)
-    return coefficients, above(error)
 
 
 def _require_kept(rows: ExpressionRows, row: StatedRow, x: Array, index: Array, limit: float) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Array
-from sparserob_core.sip.convex_set import ConvexSet
 from sparserob_core.sip.expressions.expression import Value
 from sparserob_core.sip.expressions.triangulation import MAX_MEETINGS, Simplex, find_vertices, triangulate
 
@@ -267,7 +266,7 @@ def _read_polytope(index: Mapping[str, Any]) -> Region:
 
 def _read_rows(polytope: object, dimension: int) -> tuple[Array, Array]:
     """Return the rows ``H t <= h`` of a polytope, without those that always hold."""
-    if isinstance(polytope, ConvexSet):
+    if hasattr(polytope, "halfspaces"):
         flat = polytope.halfspaces()
         if flat is None:
             raise _polytope_error("a set with finitely many faces", type(polytope).__name__)

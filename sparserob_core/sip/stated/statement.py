@@ -18,7 +18,7 @@ from sparserob_core.sip.expressions.index_sets import Index, Region, number_part
 from sparserob_core.sip.expressions.rows import ExpressionRows
 from sparserob_core.sip.expressions.statements import Decisions, StatedRow, Words, parse_cost, parse_rows, read_tables
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
-from sparserob_core.sip.stated.terms import AffineFunction, Polynomial, StatedObjective
+from sparserob_core.sip.stated.terms import AffineFunction, ExpandedCost, StatedObjective
 
 RESERVED = ("config", "objective", "lower bound", "bounds and rows", "infeasibility", "violation", "status")
 """Names of claims about a program, which no family may have."""
@@ -208,7 +208,7 @@ class StatedProgram:
         return _number_terms(self.residuals, self._words.decisions.n)
 
     @cached_property
-    def polynomial(self) -> Polynomial:
+    def polynomial(self) -> ExpandedCost:
         """The objective in the entries of the decision, but for its absolute values."""
         return self.objective.expand(self._places)
 

@@ -61,7 +61,7 @@ class AffineFunction:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Polynomial:
+class ExpandedCost:
     """Exact polynomial ``constant + sum slopes_i x_i + sum products_ij x_i x_j`` of a decision, with ``i <= j``.
 
     Nothing that cancels is in it: no coefficient is 0.
@@ -112,14 +112,14 @@ class StatedObjective:
 
     @property
     def is_sum_of_squares(self) -> bool:
-        """Whether all products are squares with weights that are not negative."""
+        """True where all products are squares with weights that are not negative."""
         return all(left is right and weight >= 0.0 for weight, left, right in self.products)
 
     def count_pairs(self) -> int:
         """Return the number of products of entries, where every product of functions is multiplied out."""
         return sum((left.positions.size + 1) * (right.positions.size + 1) for _, left, right in self.products)
 
-    def expand(self, places: Mapping[int, int]) -> Polynomial:
+    def expand(self, places: Mapping[int, int]) -> ExpandedCost:
         """Return the affine terms and the products as a polynomial.
 
         Parameters
@@ -143,7 +143,7 @@ class StatedObjective:
             for i, factor in first:
                 for j, second_factor in second:
                     products[min(i, j), max(i, j)] += scale * factor * second_factor
-        return Polynomial(
+        return ExpandedCost(
             constant,
             {i: value for i, value in slopes.items() if value},
             {key: value for key, value in products.items() if value},

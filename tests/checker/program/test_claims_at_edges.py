@@ -91,3 +91,21 @@ def test_an_excuse_beside_a_small_cost_keeps_the_gap_open() -> None:
     low = {**data, "status": "certified", "decision": [5e-10], "cost": 5e-10, "lower_bound": 5e-10}
     assert verdicts(program, low)["status"] != "holds"
     assert GAP < 1.0 and np.isfinite(data["cost"])
+
+
+@pytest.mark.parametrize(("excess", "verdict"), [(0.5e-9, "holds"), (3e-9, "fails")])
+def test_a_row_without_an_index_is_violated_by_a_billionth_of_its_terms_and_no_more(
+    excess: float, verdict: str
+) -> None:
+    program = state({"x": (None, -9.0, 9.0)}, "x", "x >= t - 2", finite=["x >= 1"])
+    data = certify(program)
+    moved = {**data, "decision": [1.0 - 2.0 * excess], "cost": 1.0 - 2.0 * excess}
+    assert judge(program, moved)["bounds and rows"].verdict == verdict
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(0.5, "holds"), (3.0, "fails")])
+def test_a_gap_of_a_few_times_the_tolerance_is_not_closed(share: float, verdict: str) -> None:
+    program = state({"x": (None, -9.0, 9.0)}, "x", "x >= 1 + t")
+    data = certify(program)
+    wide = {**data, "lower_bound": data["cost"] - share * GAP * data["cost"]}
+    assert judge(program, wide)["status"].verdict == verdict

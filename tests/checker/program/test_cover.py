@@ -122,6 +122,7 @@ def test_nothing_is_derived_of_a_polytope_with_a_gap(program: StatedProgram) -> 
     assert {name: finding.verdict for name, finding in found.items()} == {"polytope of f": "fails"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("low", [1e-6, -1e-6])
 def test_a_row_that_is_violated_on_a_slanted_side_is_seen(program: StatedProgram, low: float) -> None:
     data = certify(program)
@@ -130,6 +131,7 @@ def test_a_row_that_is_violated_on_a_slanted_side_is_seen(program: StatedProgram
     assert (families == {"holds"}) == (low < 0.0)
 
 
+@pytest.mark.slow
 def test_an_index_beyond_the_shares_of_a_simplex_is_refused(program: StatedProgram) -> None:
     data = certify(program)
     data["multipliers"]["constraints"][0]["index"] = [1.0 + 1e-12, 0.5]

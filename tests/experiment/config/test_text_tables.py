@@ -81,6 +81,7 @@ def test_a_file_that_is_too_large_is_refused_unread(tmp_path: Path, monkeypatch:
         read_table(tmp_path / "t.csv")
 
 
+@pytest.mark.slow
 def test_a_run_needs_no_file_once_it_is_written(config: Path, tmp_path: Path) -> None:
     result = sr.run(config, {"observers": []}, out=tmp_path / "run", figures=False).result
     # r is the least of m x and (m + C t) x at t = 1, where both entries give 1 and 2

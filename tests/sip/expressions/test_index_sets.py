@@ -21,7 +21,7 @@ from sparserob_core.sip.expressions.taylor import taylor_space
 from sparserob_core.sip.expressions.triangulation import affine_dimension, find_vertices, triangulate
 from tests.support.polytopes import POLYTOPES, index_of, list_corners, region_of, sample
 
-SOLID = [name for name in POLYTOPES if name not in ("flat", "line", "point", "segment")]
+SOLID = [name for name in POLYTOPES if name not in ("flat", "flat square", "line", "point", "segment")]
 UNIT = {"x": (0.0, 1.0)}
 
 

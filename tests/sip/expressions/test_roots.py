@@ -107,6 +107,7 @@ PROVEN = {  # closed forms: lines and Chebyshev's polynomial
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROVEN)
 def test_a_program_with_a_root_is_certified_and_checked(name: str) -> None:
     program, value = PROVEN[name]

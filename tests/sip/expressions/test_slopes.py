@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -102,3 +103,19 @@ def test_a_result_says_what_it_believes() -> None:
     result = sr.solve(sr.SemiInfiniteProgram(n=1, q=[1.0], families=[family]))
     assert result.status == "certified" and result.cost == pytest.approx(1.0, abs=1e-7)
     assert "what above states of its curvature is believed" in result.message
+
+
+@pytest.mark.parametrize("order", ["lipschitz", "curvature"])
+def test_a_bound_counts_the_rounding_of_its_rows(order: str) -> None:
+    """Ten negative entries of size 1e10 against a right-hand side: their sum is known to 1e-5, and no better."""
+    G = -1e10 * np.linspace(1.0, 1.9, 10)[None, None]
+
+    def rows(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.repeat(G, len(t), axis=0), np.full((len(t), 1), float(G.sum()))
+
+    zero = np.zeros(1)
+    slopes = BoundedSlopes.of(rows, zero, zero + 1.0, **{"lipschitz": None, "curvature": None, order: 0.0})
+    bound = slopes.enclose(np.ones(10), zero[None], zero[None] + 1.0)[0][0]
+    exact = sum(map(Fraction, G.ravel().tolist())) - Fraction(float(G.sum()))
+    assert bound >= exact + Fraction(1, 10**5)
+    assert bound <= 1e-3

@@ -169,6 +169,7 @@ TOGETHER = {  # with the same polynomial, multiplied out by hand
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", TOGETHER)
 def test_products_are_convex_together(text: str) -> None:
     """The least value is that of the polynomial, which is a sum of squares; no product is judged by itself."""
