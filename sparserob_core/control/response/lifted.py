@@ -440,8 +440,8 @@ class LiftedSystem:
     def _transform_orbit(self, orbit: Orbit, control: Array) -> tuple[Array, Array]:
         """Return the states of an orbit in the coordinates of this system, ``(L+1, d)``, and norm bounds ``(L+1, q)``
         of their errors."""
-        here = slice(self.first, self.first + self.grid.pieces + 1)
-        states, errors = (table[here] for table in orbit.states(control))
+        phase = slice(self.first, self.first + self.grid.pieces + 1)
+        states, errors = (table[phase] for table in orbit.states(control))
         coordinates, rounded = self.decoupling.vector(states.T)
         size = np.abs(self.decoupling.inverse).astype(float)
         errors = rounded + (np.eye(size.shape[0]) + self.decoupling.defect) @ size @ errors.T

@@ -106,8 +106,8 @@ class Measure:
     def pass_by(self, error: float, length: float, missed: Array) -> float:
         """Return the norm of an error after a piece of some length, at whose end states are ``missed (d,)`` too."""
         exponent = self.rate * length
-        grown = float(np.exp(exponent)) * (1.0 + (exponent + 1.0) * (OUTWARD - 1.0)) * error
-        return OUTWARD * (grown + float(np.linalg.norm(self.size @ missed)) * OUTWARD)
+        carried_error = float(np.exp(exponent)) * (1.0 + (exponent + 1.0) * (OUTWARD - 1.0)) * error
+        return OUTWARD * (carried_error + float(np.linalg.norm(self.size @ missed)) * OUTWARD)
 
     def enter(self, before: Measure, error: float) -> float:
         """Return the norm of an error of which the norm of the phase before is ``error``."""
@@ -177,14 +177,14 @@ class Orbit:
                 path.append(state)
                 missed.append(_bound_entries(ball - state))
             rounded = np.array([[float(entry) for entry in state.entries()] for state in path])
-            off = np.array([_bound_entries(state - column(own)) for state, own in zip(path, rounded, strict=True)])
-        errors, before, error = [np.zeros(len(off[0]))], modes[0], 0.0
+            distances = [_bound_entries(state - column(own)) for state, own in zip(path, rounded, strict=True)]
+        errors, before, error = [np.zeros(len(distances[0]))], modes[0], 0.0
         for mode, length, miss in zip(modes, self.grid.lengths.tolist(), missed, strict=True):
             measure = self._measures[mode]
             error = error if mode == before else measure.enter(self._measures[before], error)
             error, before = measure.pass_by(error, length, miss), mode
             errors.append(measure.entries(error))
-        return rounded, OUTWARD * (off + np.array(errors))
+        return rounded, OUTWARD * (np.array(distances) + np.array(errors))
 
     @cached_property
     def _measures(self) -> list[Measure]:

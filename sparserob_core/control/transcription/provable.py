@@ -95,8 +95,8 @@ def promised(model: Transcription) -> list[str]:
     moved = np.abs(weights[..., : reach.size]).sum(axis=1) @ reach * np.finfo(float).eps / 2.0
     state = int(np.argmax(moved))
     name, units = problem.names.state(state), problem.names.state_units
-    off = f"{moved[state]:.1g} {units[state]}" if state < len(units) else f"{moved[state]:.1g}"
-    digits = f"in open loop an error in the last digit of the control ends up to {off} off in {name}"
+    distance = f"{moved[state]:.1g} {units[state]}" if state < len(units) else f"{moved[state]:.1g}"
+    digits = f"in open loop an error in the last digit of the control ends up to {distance} off in {name}"
     return [f"{digits}; feedback does not let it grow"]
 
 
