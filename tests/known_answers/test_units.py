@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.response.response import Propagator, Weights
+from sparserob_core.control.response.inner_loop import Weights
+from sparserob_core.control.response.response import Propagator
 from sparserob_core.sip.methods.own_units import UsersUnits
 from tests.support.draws import taken
 

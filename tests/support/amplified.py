@@ -91,7 +91,8 @@ def exceeded(problem: Amplified, outcome: sr.Outcome) -> float:
 
     with ctx.workprec(BITS):
         solution = dict(np.load(outcome.directory / "solution.npz"))
-        control, breakpoints, gains = solution["control"], solution["breakpoints"], solution.get("gains")
+        breakpoints, gains, inner = solution["breakpoints"], solution.get("gains"), solution.get("prestabilise")
+        control = solution["control"] if inner is None else solution["theta"]
         d, K = len(problem.A), control.shape[1]
         mw = 0 if problem.E is None else problem.E.shape[1]
         steps = [_step(problem, (b - a) / INSIDE) for a, b in pairwise(breakpoints)]
@@ -102,6 +103,8 @@ def exceeded(problem: Amplified, outcome: sr.Outcome) -> float:
             for j, innovation in enumerate(innovations):
                 if gains is not None:
                     u = u + arb_mat(gains[k, j + 1].tolist()) * innovation
+            if inner is not None:
+                u = u + arb_mat(inner[k].tolist()) * state
             pushed = arb_mat(d, 1 + K * mw)
             if Delta is not None:
                 chosen = arb_mat(

@@ -7,7 +7,7 @@ answers nothing has no deviations here, and no innovations."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, final
 
@@ -23,7 +23,8 @@ from sparserob_core.checker.cost.effort import prove_effort_limit
 from sparserob_core.checker.cost.gains import GainsBound, reach
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, Broken, Unchecked
 from sparserob_core.checker.problem.timing import before
-from sparserob_core.checker.reach.closed_loop import VerifiedLoop
+from sparserob_core.checker.reach.closed_loop import NO_GAINS, VerifiedLoop
+from sparserob_core.checker.reach.inner_loop import PlantInputs, StateBound
 from sparserob_core.checker.sets.known import known
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -78,9 +79,10 @@ class VerifiedFeedback:
     @cached_property
     def loop(self) -> VerifiedLoop:
         """The system under the nominal control and the gains."""
-        return self._close_loop(self.case.pieces, self.gains)
+        case = self.case
+        return self._close_loop(case.on_pieces(case.theta), self.gains, case.inner.gains)
 
-    def _close_loop(self, nominal: Sequence[arb_mat], gains: Array) -> VerifiedLoop:
+    def _close_loop(self, nominal: Sequence[arb_mat], gains: Array, inner: Array = NO_GAINS) -> VerifiedLoop:
         """Return the closed loop. Raise `Unchecked` for the kinds of systems and disturbances that the checker does not
         know under feedback."""
         case = self.case
@@ -104,6 +106,7 @@ class VerifiedFeedback:
             case.problem.measurements,
             self.observer,
             law=case.flows.at(()),
+            inner=inner,
         )
 
     @cached_property
@@ -178,7 +181,7 @@ class VerifiedFeedback:
             return written.max(squares)  # an effort is never less than 0
         for k, costs in enumerate(case.price.costs):
             for i, price in enumerate(costs):
-                u, row = ball(case.theta[i, k]), self.loop.effects[k][i]
+                u, row = case.pieces[k][i, 0], self.loop.effects[k][i]
                 height = (u + self.support(row)).max(-u + self.support([-x for x in row]))
                 total = total + price * height
         return total + squares
@@ -189,7 +192,7 @@ class VerifiedFeedback:
         a, A = [], []
         for k, costs in enumerate(case.price.costs):
             for i, price in enumerate(costs):
-                a.append(price * ball(case.theta[i, k]))
+                a.append(price * case.pieces[k][i, 0])
                 A.append([price * x for x in loop.effects[k][i]])
         deviations = loop.deviations
         axes = [[ball(int(b == axis)) for b in range(deviations.starts[-1])] for axis in range(deviations.starts[-1])]
@@ -201,11 +204,11 @@ class VerifiedFeedback:
         weighted ``rows``, with the cost where ``priced``. Peaks and the effort are bounded by the set of the control
         alone; the gains by its width: ``h(F_kl) + h(-F_kl) <= width``, summed over the blocks ``l``."""
         case, total, largest_effort = self.case, ball(0), ball(0)
-        for k, costs in enumerate(case.price.costs if case.charge in (PEAK, WORST) else ()):
+        for k, costs in enumerate(case.price.costs if self.charges_bounds else ()):
             for i, price in enumerate(costs):
                 largest_value = reach(case.problem.control, i)
                 largest_effort = largest_effort + price * largest_value
-                if case.charge == PEAK:
+                if case.charge != WORST:
                     remaining_price = price * int(priced) - sum(
                         (ball(y) for y, row in rows if row.charged == (k, i)), ball(0)
                     )
@@ -215,10 +218,28 @@ class VerifiedFeedback:
             total = total + (remaining_price * largest_effort).min(ball(0))
         return total - self._gains_bound.of(rows) if case.answering else total
 
+    @property
+    def charges_bounds(self) -> bool:
+        """True where the price of the control is that of numbers which bound it: peaks, the effort, or beside an inner
+        loop the absolute values of the nominal control."""
+        return self.case.charge in (PEAK, WORST) or self.case.inner.acts
+
+    @cached_property
+    def range(self) -> ConvexSet:
+        """The set of the decided part of the control on every piece, with its answers: the set of the control, or
+        beside an inner loop a box that is wider by what that loop may add."""
+        return self.case.inner.widen(self.case.problem.control, lambda: _collect_inputs(self.case))
+
+    def on_decided(self, row: ConstraintRow, named: NamedDeviations) -> ConstraintRow:
+        """Return a row of the control under named deviations as one of its decided part, which is the same without an
+        inner loop."""
+        constant, slope = self.case.inner.on_decided(row.slope, lambda: named.entering)
+        return replace(row, constant=row.constant + constant, slope=slope)
+
     @cached_property
     def _gains_bound(self) -> GainsBound:
         """The upper bound of how far all gains together can lower a weighted sum of constraints."""
-        return GainsBound(self.loop_at_rest, self.case.answers, self.case.problem.control)
+        return GainsBound(self.loop_at_rest, self.case.answers, self.range)
 
     @cached_property
     def loop_at_rest(self) -> VerifiedLoop:
@@ -252,6 +273,48 @@ class VerifiedFeedback:
         return NamedDeviations(self.case, named.loop, [*inner_deviations, deviation])
 
 
+def _collect_inputs(case: Case) -> PlantInputs:
+    """Return what drives the plant, and what bounds its states."""
+    control = [_span(case.problem.control, axis) for axis in np.eye(case.problem.system.controls)]
+    states, initial = balls(np.asarray(case.problem.initial_state)), case.problem.initial_set
+    if initial is not None:
+        states = [x + _span(initial, axis) for x, axis in zip(states, np.eye(len(states)), strict=True)]
+    width = case.problem.system.disturbances
+    disturbance = [ball(0.0)] * width
+    if case.problem.disturbance is not None:
+        disturbance = [_span(case.problem.disturbance, axis) for axis in np.eye(width)]
+    columns = [arb_mat(len(values), 1, values) for values in (states, control, disturbance)]
+    return PlantInputs(columns[0], columns[1], columns[2], _bound_states(case))
+
+
+def _bound_states(case: Case) -> list[StateBound]:
+    """Return the bounds of rows on the state, from both sides, at the breakpoints at which a constraint holds."""
+    bounds, times = list[StateBound](), case.control.breakpoints.tolist()
+    for window in case.windows:
+        if window.is_mixed or window.reference is not None:
+            continue
+        facets = window.enclosed_set.facets
+        normals = [np.asarray(c) for c, _ in facets] if facets is not None else list(np.eye(window.states))
+        sides = [(c, window.limit(c, window.start), window.limit(-c, window.start)) for c in normals]
+        sides = [(c, b, a) for c, b, a in sides if b.is_finite() and a.is_finite()]
+        if sides:
+            value = arb_mat(len(sides), 1, [(-a).union(b) for _, b, a in sides])
+            holds = [window.start <= time <= window.stop for time in times]
+            rows = np.array([c for c, _, _ in sides])
+            bounds.append(StateBound(rows, [value if is_held else None for is_held in holds]))
+    none = [None] * (len(times) - 1)
+    for state, goal in case.equalities:
+        axis = np.eye(case.problem.system.states)[[state]]
+        bounds.append(StateBound(axis, [*none, arb_mat(1, 1, [ball(goal)])]))
+    return bounds
+
+
+def _span(shape: ConvexSet, axis: Array) -> arb:
+    """Return a ball that contains the values of a set along an axis."""
+    high, low = (known(shape).support(balls(sign * axis)) for sign in (1.0, -1.0))
+    return (-low).union(high)
+
+
 def commanded(case: Case, name: str) -> ConvexSet | None:
     """Return the set in which the named constraint keeps the control or its steps; ``None`` for one on the state."""
     if any(window.name == name for window in case.windows):
@@ -280,6 +343,17 @@ class NamedDeviations:
         return [sum((a * b for a, b in zip(row[1:], deviations, strict=True)), row[0]) for row in rows]
 
     @property
+    def entering(self) -> list[list[arb]]:
+        """Contribution of the deviations to the state at every breakpoint since the one before, ``(K, d)``, where the
+        whole state is measured."""
+        return self._see(self.z)
+
+    @property
+    def middles(self) -> NamedDeviations:
+        """The middles of the sets: no deviation."""
+        return NamedDeviations(self.case, self.loop, [[ball(0)] * len(block) for block in self.z])
+
+    @property
     def innovations(self) -> list[list[arb]]:
         """The innovations at every breakpoint, ``(K, p)``, less those under points of the sets next to the middles. A
         rounded middle may lie outside of a thin set, and differences from it outside of its span."""
@@ -290,6 +364,10 @@ class NamedDeviations:
             else [x - r for x, r in zip(deviation, inner_deviation, strict=True)]
             for deviation, inner_deviation in pairs
         ]
+        return self._see(z)
+
+    def _see(self, z: Sequence[Sequence[arb]]) -> list[list[arb]]:
+        """Return the innovations at every breakpoint, ``(K, p)``, that deviations make block by block."""
         return [
             [
                 sum(

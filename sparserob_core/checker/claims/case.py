@@ -9,7 +9,7 @@ from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any, final, get_args
 
 import numpy as np
-from flint import arb, arb_mat
+from flint import arb, arb_mat, ctx
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import stacked
@@ -17,6 +17,7 @@ from sparserob_core.checker.claims.window import AddedTerms, ConstraintWindow
 from sparserob_core.checker.cost.duality import Duality
 from sparserob_core.checker.cost.price import Price
 from sparserob_core.checker.flow.flows import VerifiedFlows
+from sparserob_core.checker.flow.segment import SHARP
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.problem.disturbances import Disturbances
 from sparserob_core.checker.problem.held import on_one_grid
@@ -26,8 +27,10 @@ from sparserob_core.checker.problem.superposition import parted
 from sparserob_core.checker.problem.time_varying import make_time_varying
 from sparserob_core.checker.problem.timing import Timing, before
 from sparserob_core.checker.reach.followed import FollowedRows
+from sparserob_core.checker.reach.inner_loop import NoInnerLoop, VerifiedInnerLoop, lost_digits
 from sparserob_core.checker.reach.sources import Sources
 from sparserob_core.checker.reach.states import Scene, StatesOverBoxes
+from sparserob_core.checker.sets.known import middle
 from sparserob_core.control.policies.policy import MAX_ANSWERING, Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -172,7 +175,7 @@ class Case:
     @cached_property
     def flows(self) -> VerifiedFlows:
         """The flows of the system, over boxes of its parameters and at single parameters."""
-        return VerifiedFlows.of(self.problem.system, self.timing.until)
+        return VerifiedFlows.of(self.problem.system, self.timing.until, 2.0**-ctx.prec if lost_by(self) else SHARP)
 
     @cached_property
     def states(self) -> StatesOverBoxes:
@@ -186,8 +189,24 @@ class Case:
 
     @cached_property
     def pieces(self) -> list[arb_mat]:
-        """The control ``(m, 1)`` on every piece of its dictionary."""
-        return self.on_pieces(self.theta)
+        """The control ``(m, 1)`` on every piece of its dictionary; under feedback the nominal one."""
+        return self.inner.nominal(self.on_pieces(self.theta))
+
+    @cached_property
+    def inner(self) -> VerifiedInnerLoop | NoInnerLoop:
+        """The inner loop of the policy."""
+        gains, problem = _read_inner_gains(self), self.problem
+        if not gains.size:
+            return NoInnerLoop()
+        start = balls(np.asarray(problem.initial_state))
+        if problem.initial_set is not None:
+            start = [a + b for a, b in zip(start, balls(middle(problem.initial_set)), strict=True)]
+        disturbance = np.zeros(problem.system.disturbances)
+        if problem.disturbance is not None:
+            disturbance = middle(problem.disturbance)
+        grid = sorted({*self.timing.grid, *(self.disturbances.changes or [])})
+        breakpoints = self.control.breakpoints.tolist()
+        return VerifiedInnerLoop(self.flows.at(()), breakpoints, grid, gains, start, disturbance)
 
     def on_pieces(self, coefficients: Array) -> list[arb_mat]:
         """Return the control ``(m, 1)`` on every piece of its dictionary, from its coefficients ``(m, N)``. Equal
@@ -243,16 +262,10 @@ class Case:
             return None
         return AddedTerms(window, basis, gains, self.control.breakpoints.tolist(), self.pieces, entering)
 
-    @property
-    def nominal_parameter(self) -> list[float]:
-        """The parameter ``(nu,)`` of the nominal trajectory, at which the middle of the disturbance is propagated."""
-        bound = self.problem.system.parameters
-        return [] if bound is None else nominal_point(bound).tolist()
-
     @cached_property
     def price(self) -> Price:
         """The cost of the problem."""
-        return Price(self.problem, self.control, self.flows.at(self.nominal_parameter), self.clock)
+        return Price(self.problem, self.control, self.flows.at(nominal_parameter(self.problem)), self.clock)
 
     @cached_property
     def duality(self) -> Duality:
@@ -266,6 +279,41 @@ class Case:
             disturbances.held,
             disturbances.held_components,
         )
+
+
+def nominal_parameter(problem: OptimalControlProblem) -> list[float]:
+    """Return the parameter ``(nu,)`` of the nominal trajectory, at which the middle of the disturbance is
+    propagated."""
+    bound = problem.system.parameters
+    return [] if bound is None else nominal_point(bound).tolist()
+
+
+def _read_inner_gains(case: Case) -> Array:
+    """Return the gains ``(K, m, d)`` of a feedback of the state beside the decision; an empty array where the policy
+    has none."""
+    if case.policy is None or case.policy.inner_gain is None:
+        return np.zeros((0, 0, 0))
+    problem, system = case.problem, case.problem.system
+    if problem.measurements is not None or system.delay > 0.0 or problem.repeat:
+        raise Unchecked("the checker knows an inner loop beside states that are measured at once, for one period")
+    if system.parameter_count or system.varies:
+        raise Unchecked("the checker knows an inner loop of known systems that do not change with time")
+    return shaped(case.certificate, "prestabilise", (case.control.pieces, system.controls, system.states))
+
+
+def lost_by(case: Case) -> float:
+    """Return the exponent of what balls and multipliers lose beside an inner loop; 0 without one. More digits are kept
+    there; no claim rests on it."""
+    try:
+        gains = _read_inner_gains(case)
+    except (Broken, Unchecked):  # the claims about them say so
+        return 0.0
+    matrices = (
+        [[matrix[0] for matrix in mode.matrices(np.zeros((1, 0)))[:2]] for mode in case.problem.system.modes]
+        if gains.size
+        else []
+    )
+    return lost_digits(matrices, np.diff(case.control.breakpoints), gains)
 
 
 def _make_window(
@@ -331,7 +379,8 @@ def written_policy(certificate: Mapping[str, Any], pieces: int) -> WrittenPolicy
             if not is_range or not 0 <= indices[0] <= indices[1] <= k:
                 raise Broken(f"policy: piece {k + 1} answers the breakpoints {indices!r}, expected a range up to {k}")
             mask[k, indices[0] : indices[1] + 1] = True
-    return WrittenPolicy(mask, Charge(cost))
+    inner = certificate.get("prestabilise")
+    return WrittenPolicy(mask, Charge(cost), None if inner is None else numbers(inner, "prestabilise"))
 
 
 def number(data: Mapping[str, Any], name: str) -> float:

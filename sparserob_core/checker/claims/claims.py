@@ -13,7 +13,7 @@ from sparserob_core.checker.arithmetic.balls import ball, below
 from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.claims import activity
 from sparserob_core.checker.claims.answers import feedback_of
-from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers, written_policy
+from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, lost_by, number, numbers, written_policy
 from sparserob_core.checker.claims.cells import Work, prove
 from sparserob_core.checker.claims.constraints import bounded, equalities
 from sparserob_core.checker.claims.multipliers import multiplied, weighted
@@ -110,6 +110,7 @@ def precision_of(case: Case) -> int:
     sizes = np.abs(entries[np.isfinite(entries) & (entries != 0.0)])
     range_bits = np.log2(max(1.0, sizes.max(initial=1.0))) - np.log2(min(1.0, sizes.min(initial=1.0)))
     extra_bits = VARYING if problem.system.varies else 0
+    extra_bits += np.ceil(lost_by(case) / np.log(2.0))
     return int(min(PRECISION + extra_bits + np.ceil(range_bits), MAX_PRECISION))
 
 
@@ -142,6 +143,9 @@ def _verify_policy(case: Case) -> str:
     written = written_policy(case.certificate, case.control.pieces)
     if written.charge.cost != case.charge:
         raise Broken(f"the cost {written.charge.cost} is written, the config asks for {case.charge}")
+    gain = None if case.policy is None else case.policy.inner_gain
+    if gain is not None and not isinstance(gain, str) and not (case.inner.gains == np.asarray(gain)).all():
+        raise Broken("other gains of an inner loop are written than those of the config")
     different = np.argwhere(written.mask != case.answers)
     if different.size:
         k, j = different[0].tolist()

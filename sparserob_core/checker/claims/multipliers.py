@@ -15,7 +15,7 @@ from flint import arb, arb_mat
 from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.claims.answers import PEAK, WORST, NamedDeviations, feedback_of
-from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers, shaped
+from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, nominal_parameter, number, numbers, shaped
 from sparserob_core.checker.claims.constraints import compute_middle_effect
 from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow
@@ -32,8 +32,10 @@ def multiplied(case: Case, priced: bool) -> arb:
     data = case.certificate.get("multipliers")
     rows, pieces = weighted(case, data)
     price, touched = (case.price, touched_by(case, data)) if priced else (None, None)
-    lengths, norms = case.charge not in (PEAK, WORST), norms_of(case, data) if priced else None
-    return case.duality.bound(rows, pieces, price, touched, lengths, norms) + feedback_of(case).least(rows, priced)
+    feedback, norms = feedback_of(case), norms_of(case, data) if priced else None
+    duality = replace(case.duality, range=feedback.range)
+    bound = duality.bound(rows, pieces, price, touched, not feedback.charges_bounds, norms)
+    return bound + feedback.least(rows, priced)
 
 
 def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]], Any]:
@@ -52,7 +54,9 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
         raise Broken(f"{nu.size} multipliers of equalities, expected {len(case.equalities)}")
     for multiplier, (state, value) in zip(nu.tolist(), case.equalities, strict=False):
         direction = np.eye(case.problem.system.states)[state]
-        row = case.duality.row(direction, case.problem.horizon, case.nominal_parameter, ball(value), disturbed=False)
+        row = case.duality.row(
+            direction, case.problem.horizon, nominal_parameter(case.problem), ball(value), disturbed=False
+        )
         # a disturbance of one point counts; where none may reach the state, any member of its set may stand for it
         rows.append((multiplier, replace(row, constant=row.constant + compute_middle_effect(case, state))))
     if case.control.functions >= case.control.pieces:  # every piece has a function of its own
@@ -98,14 +102,14 @@ def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
     if name == EFFORT and case.charge == WORST:
         return [(y, _derive_effort_row(case, direction, named))]
     sized(direction, case.problem.system.controls, name)
-    if name in (case.of_control, PEAK) and (name != PEAK or case.charge == PEAK):
+    if name in (case.of_control, PEAK) and (name != PEAK or _charges_peaks(case)):
         return [(y, _derive_control_row(case, name, direction, time, named))]
     if name != STEP:
         raise Broken(f"the problem has no constraint {name!r}")
     row = case.duality.step_row(direction, time)
     if named is None:
         return [(y, row)]
-    answered_row = replace(row, innovations=named.innovations)
+    answered_row = _answer(case, row, named, named.innovations)
     if time != float(case.control.breakpoints[-1]):
         return [(y, answered_row)]
     next_deviations, zero = feedback_of(case).following(named, entry, name), ball(0)
@@ -129,7 +133,21 @@ def _derive_state_row(
     if named is None:
         return row
     contribution = named.given(direction[: case.problem.system.states], time)
-    return replace(row, constant=row.constant + contribution, innovations=named.innovations)
+    return _answer(case, replace(row, constant=row.constant + contribution), named, named.innovations)
+
+
+def _answer(
+    case: Case, row: ConstraintRow, named: NamedDeviations, innovations: Sequence[Sequence[arb]]
+) -> ConstraintRow:
+    """Return a row on the control under named deviations as one on the decided part of the control, which answers these
+    innovations."""
+    return feedback_of(case).on_decided(replace(row, innovations=innovations), named)
+
+
+def _charges_peaks(case: Case) -> bool:
+    """Return whether numbers bound the control from both sides: its peaks, or beside an inner loop the absolute values
+    of the nominal control."""
+    return feedback_of(case).charges_bounds and case.charge != WORST
 
 
 def _name_row(_: Case, window: object, entry: Mapping[str, Any], said: tuple[str, Array, float, Array]) -> Hashable:
@@ -163,19 +181,19 @@ def _derive_control_row(
     """Return the constraint on the control of one piece: it is in its set, or a channel is at most its peak."""
     row, piece = case.duality.control_row(direction, time), case.duality.control_piece(time)
     if named is not None:
+        named = named.middles if name == PEAK and case.charge != PEAK else named  # then the nominal control is charged
         innovations = named.innovations
-        row = replace(
-            row,
-            innovations=[
-                *innovations[: piece + 1],
-                *([x * 0 for x in innovation] for innovation in innovations[piece + 1 :]),
-            ],
-        )
+        measured_innovations = [
+            *innovations[: piece + 1],
+            *([x * 0 for x in innovation] for innovation in innovations[piece + 1 :]),
+        ]
+        row = _answer(case, row, named, measured_innovations)
     if name != PEAK:
         return row
     if sorted(np.abs(direction).tolist()) != [0.0] * (direction.size - 1) + [1.0]:
         raise Broken(f"{name}: the direction {direction.tolist()} is not that of a peak of this policy")
-    return replace(row, constant=ball(0), charged=(piece, int(np.abs(direction).argmax())))
+    limit = case.duality.control_row(direction, time).constant
+    return replace(row, constant=row.constant - limit, charged=(piece, int(np.abs(direction).argmax())))
 
 
 def _derive_effort_row(case: Case, shares: Array, named: NamedDeviations | None) -> ConstraintRow:
@@ -186,7 +204,8 @@ def _derive_effort_row(case: Case, shares: Array, named: NamedDeviations | None)
     slope = [
         [price * ball(shares[i * K + k]) for i, price in enumerate(costs)] for k, costs in enumerate(case.price.costs)
     ]
-    return ConstraintRow(ball(0), slope, None, () if named is None else named.innovations, EFFORT)
+    row = ConstraintRow(ball(0), slope, None, (), EFFORT)
+    return row if named is None else _answer(case, row, named, named.innovations)
 
 
 def fixed_limit(case: Case, direction: Array, time: float) -> arb:

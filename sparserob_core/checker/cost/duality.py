@@ -59,7 +59,8 @@ class Duality:
 
     ``changes`` are the times at which the disturbance may jump, ``None`` without a disturbance. ``held`` is the set of
     the disturbances that are constant between these times. ``flows`` weigh the rows. ``held_components``
-    says which components are held over several intervals.
+    says which components are held over several intervals. ``range`` is the set of the decided control on every piece,
+    where that is not the set of the control.
     """
 
     problem: OptimalControlProblem
@@ -68,6 +69,7 @@ class Duality:
     flows: VerifiedFlows | FollowedRows
     held: ConvexSet | None = None
     held_components: HeldComponents | None = None
+    range: ConvexSet | None = None
 
     def control_piece(self, time: float) -> int:
         """Return the index of the piece of the control that is commanded at a time."""
@@ -175,7 +177,7 @@ class Duality:
                 constant = constant + self._bound_least_cost(cost, size, slope, groups, touched[k].entries(), offered)
             else:
                 weights = [a + b for a, b in zip(cost, size, strict=True)]
-                constant = constant + known(self.problem.control).least(weights, weights, slope)
+                constant = constant + known(self.range or self.problem.control).least(weights, weights, slope)
         return constant
 
     def _bound_least_cost(

@@ -14,6 +14,7 @@ from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.flow.flow import POINTS_KEPT, StateWeights, VerifiedFlow
 from sparserob_core.checker.flow.law import Law, ParameterBox, bound_entries
 from sparserob_core.checker.flow.plant import Plant
+from sparserob_core.checker.flow.segment import SHARP
 from sparserob_core.checker.flow.units import pace
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.problem.system import System
@@ -30,18 +31,20 @@ ASIDE = 0.3819  # distance of `aside` from the middle of the parameters, as a sh
 @final
 @dataclass(eq=False)
 class VerifiedFlows:
-    """The flows of a ``plant`` up to the time ``until``, whose parameters are in a ``box``."""
+    """The flows of a ``plant`` up to the time ``until``, whose parameters are in a ``box``. Guesses of flows at single
+    parameters aim at the relative error ``sharp``."""
 
     plant: Plant
     until: float
     box: ParameterBox = ParameterBox()  # noqa: RUF009  immutable
+    sharp: float = SHARP
 
     @staticmethod
-    def of(system: System, until: float) -> VerifiedFlows:
+    def of(system: System, until: float, sharp: float = SHARP) -> VerifiedFlows:
         """Return the flows of a system over the bounding box of its parameters."""
         bound = None if system.parameters is None else system.parameters.bounding_box()
         box = ParameterBox() if bound is None else ParameterBox.between(bound.lower.tolist(), bound.upper.tolist())
-        return VerifiedFlows(Plant.of(system, until), until, box)
+        return VerifiedFlows(Plant.of(system, until), until, box, sharp)
 
     def at(self, parameter: Sequence[float]) -> VerifiedFlow:
         """Return the flow at one parameter, of which there may be none."""
@@ -65,7 +68,7 @@ class VerifiedFlows:
 
     @cached_property
     def _point_flow(self) -> VerifiedFlow:
-        return VerifiedFlow(self.plant, self.until)
+        return VerifiedFlow(self.plant, self.until, sharp=self.sharp)
 
     @property
     def degree(self) -> int:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
@@ -21,6 +21,7 @@ import numpy as np
 from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.balls import ball, balls
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import around, exactly, identity, stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant, modes_at
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from sparserob_core.control.policies.measurements import Measurements
     from sparserob_core.control.problem.system import System
 
+NO_GAINS = np.zeros((0, 0, 0))
 ORDER = 8  # degree of the states in the time on a cell; the remainder counts twice, half of it needs shorter cells
 
 
@@ -61,6 +63,8 @@ class VerifiedLoop:
         innovations of it; ``None`` where the whole state is measured.
     law
         The flow of the system, where it is known already.
+    inner
+        The gains ``(K, m, d)`` of a feedback of the state at the breakpoints, beside the answers; empty without one.
     """
 
     system: System
@@ -76,6 +80,7 @@ class VerifiedLoop:
     measured: Measurements | None = None
     observer: Array | None = None
     law: VerifiedFlow | None = None
+    inner: Array = field(default_factory=lambda: NO_GAINS)
 
     @cached_property
     def flow(self) -> VerifiedFlow:
@@ -184,39 +189,33 @@ class VerifiedLoop:
     @cached_property
     def effects(self) -> list[list[list[arb]]]:
         """The matrices ``F_k (m, Q)`` by which the control on each piece depends on the deviations."""
-        m, zero, starts = self.gains.shape[2], ball(0), self.deviations.starts
-        table = []
-        for k in range(self.gains.shape[0]):
-            rows = [[zero] * starts[-1] for _ in range(m)]
-            for j in range(k + 1):
-                if not self.gains[k, j].any():
-                    continue
-                M = exactly(self.gains[k, j])
-                for block, matrix in self.innovation_matrices[j].items():
-                    for i, row in enumerate((M * matrix).tolist()):
-                        for b, value in enumerate(row):
-                            rows[i][starts[block] + b] = rows[i][starts[block] + b] + value
-            table.append(rows)
-        return table
+        return [[row[1:] for row in self.inputs(k).tolist()] for k in range(self.gains.shape[0])]
 
-    @cached_property
+    def _drive(self, piece: int, control: arb_mat) -> arb_mat:
+        """Return the inputs on a piece of the grid, control, drift and disturbance, as nominal values and responses:
+        with a drift ``(m + 1 + mw, 1 + Q)``, without one ``(m + mw, 1 + Q)``."""
+        _, block = self._find_acting_indices(piece)
+        zeros = [0.0] * self.deviations.starts[-1]
+        drift = [balls([1.0, *zeros])] if self.flow.driven > self.system.controls else []
+        entering = [balls([middle, *zeros]) for middle in self.deviations.middle.tolist()]
+        for i, row in enumerate(entering if self.deviations.blocks else ()):
+            column = 1 + block * self.system.disturbances + i
+            row[column] = row[column] + 1
+        return stacked([*control.tolist(), *drift, *entering])
+
+    @property
     def drives(self) -> list[arb_mat]:
-        """The inputs on each piece of the grid, control, drift and disturbance, as nominal values and responses: with a
-        drift ``(m + 1 + mw, 1 + Q)``, without one ``(m + mw, 1 + Q)``."""
-        drives, zeros = [], [0.0] * self.deviations.starts[-1]
-        for piece in range(len(self.grid) - 1):
-            k, block = self._find_acting_indices(piece)
-            drift = [balls([1.0, *zeros])] if self.flow.driven > self.system.controls else []
-            entering = [balls([middle, *zeros]) for middle in self.deviations.middle.tolist()]
-            for i, row in enumerate(entering if self.deviations.blocks else ()):
-                column = 1 + block * self.system.disturbances + i
-                row[column] = row[column] + 1
-            drives.append(stacked([*self.inputs(k).tolist(), *drift, *entering]))
-        return drives
+        """The inputs on each piece of the grid (`_drive`)."""
+        return self._path[1]
 
-    @cached_property
+    @property
     def nodes(self) -> list[arb_mat]:
         """The nominal state and the responses to all deviations at every breakpoint of the grid, ``(d, 1 + Q)``."""
+        return self._path[0]
+
+    @cached_property
+    def _path(self) -> tuple[list[arb_mat], list[arb_mat], dict[int, arb_mat]]:
+        """The `nodes`, the `drives`, and the control on every piece with its answers, ``(m, 1 + Q)``."""
         begin, answers = [ball(v) for v in self.initial_state], identity(self.system.states).tolist()
         if self.initial is None:
             answers = [[] for _ in begin]
@@ -224,10 +223,25 @@ class VerifiedLoop:
             begin = [v + ball(m) for v, m in zip(begin, self.deviations.sets[-1][1], strict=True)]
         zero = [ball(0)] * self.deviations.starts[self.deviations.initial_block]
         nodes = [stacked([[v, *zero, *row] for v, row in zip(begin, answers, strict=True)])]
+        drives, controls, beginning = list[arb_mat](), dict[int, arb_mat](), nodes[0]
+        d, m = self.system.states, self.system.controls
         for piece, ends in enumerate(pairwise(self.grid)):
-            Phi, effect = self._compute_part_flow(piece, *ends)
-            nodes.append(Phi * nodes[-1] + effect)
-        return nodes
+            k = self._find_acting_indices(piece)[0]
+            if k not in controls:
+                controls[k], K = self._decide(k), exactly(self.inner[k]) if self.inner.size else None
+                beginning, transition, added = nodes[-1], identity(d), nodes[-1] * 0
+                controls[k] = controls[k] if K is None else controls[k] + K * beginning
+            drives.append(self._drive(piece, controls[k]))
+            flow, forced, disturbed = self.flow.over(*ends)
+            Phi, Gamma = flow.matrix, forced.append_columns(disturbed).matrix
+            if K is None:
+                nodes.append(Phi * nodes[-1] + Gamma * drives[-1])
+                continue
+            # the state where the control began is multiplied once, since signs that are lost in balls do not come back
+            transition = Phi * transition + forced.columns(0, m).matrix * K
+            added = Phi * added + Gamma * self._drive(piece, self._decide(k))
+            nodes.append(transition * beginning + added)
+        return nodes, drives, controls
 
     def state(self, piece: int, time: float) -> arb_mat:
         """Return the nominal state and the responses at a time in a piece of the grid, ``(d, 1 + Q)``."""
@@ -241,14 +255,26 @@ class VerifiedLoop:
     def inputs(self, k: int) -> arb_mat:
         """Return the nominal control and its answers on a piece of the control, ``(m, 1 + Q)``; on piece -1 the control
         before."""
-        none = [ball(0)] * self.deviations.starts[-1]
+        return self._path[2][k] if self.inner.size else self._decide(k)
+
+    @remembered()
+    def _decide(self, k: int) -> arb_mat:
+        """Return the `inputs` on a piece of the control, without what the inner loop adds."""
+        starts, zero = self.deviations.starts, ball(0)
         if k < 0:
-            return stacked([[ball(v), *none] for v in self.before])
-        return stacked([[v, *row] for v, row in zip(self.nominal[k].entries(), self.effects[k], strict=True)])
+            return stacked([[ball(v), *[zero] * starts[-1]] for v in self.before])
+        rows = [[v, *[zero] * starts[-1]] for v in self.nominal[k].entries()]
+        for j in np.flatnonzero(self.gains[k].any(axis=(1, 2))).tolist():
+            M = exactly(self.gains[k, j])
+            for block, matrix in self.innovation_matrices[j].items():
+                for row, values in zip(rows, (M * matrix).tolist(), strict=True):
+                    for b, value in enumerate(values, 1 + starts[block]):
+                        row[b] = row[b] + value
+        return stacked(rows)
 
     def answers(self, k: int) -> arb_mat:
         """Return the answers on a piece of the control with 0 as nominal control, ``(m, 1 + Q)``."""
-        return stacked([[ball(0), *row] for row in self.effects[k]])
+        return stacked([[ball(0), *row[1:]] for row in self.inputs(k).tolist()])
 
     def on(self, piece: int) -> int:
         """Return the index of the piece of the control that is commanded on a piece of the grid. Without a delay, this

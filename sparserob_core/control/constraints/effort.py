@@ -12,6 +12,7 @@ from sparserob_core.control.constraints.explanation import ConstraintSource, Tim
 from sparserob_core.control.constraints.feedback import describe_deviations, not_linear
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop
 from sparserob_core.control.feedback.effort import Effort, largest_effort
+from sparserob_core.control.feedback.loop_rows import LoopRows
 from sparserob_core.control.problem.units import Units
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.finite import UncertainRows
@@ -93,9 +94,11 @@ class FeedbackEffort(ConstraintSource):
         g = np.zeros((count, loop.variables))
         g[:, : weight.size] = self._row_signs[:, None] * weight
         g[:, self.bound] = -1.0
-        return UncertainRows(
+        rows = UncertainRows(
             csr_array(g), np.zeros(count), np.zeros(count, dtype=int), self._row_signs, (C,), np.zeros((1, Q))
         )
+        controls = self._row_signs[:, None, None] * weight.reshape(m, -1).T
+        return LoopRows(loop).with_controls(rows, controls)
 
     def effort(self, x: Array) -> Effort:
         """Return bounds of the largest effort at the decision ``x (n,)``."""

@@ -377,8 +377,8 @@ class FeedbackControl(ConstraintSource):
     """Constraint ``H a <= h`` for every disturbance, on the value ``a`` of the control on every piece or on its change
     at every step.
 
-    With ``bound``, the position of the first of the variables ``p (m, K)``, it is ``H u_k <= p_k`` instead. An index is
-    the time of a place, or with the deviations ``(t, w)``.
+    With ``bound``, the position of the first of the variables ``p (m, K)``, it is ``H u_k <= p_k`` instead; that of the
+    ``nominal`` control, where this says so. An index is the time of a place, or with the deviations ``(t, w)``.
     """
 
     name: str
@@ -387,6 +387,7 @@ class FeedbackControl(ConstraintSource):
     H: Array
     h: Array
     bound: int | None = None
+    nominal: bool = False
 
     def normals_in(self, units: Units) -> tuple[Array, Array]:
         """Return the normals ``H`` of the rows, and the units of the controls."""
@@ -419,6 +420,8 @@ class FeedbackControl(ConstraintSource):
         """Return violations ``(q, r)`` at all places, and the sizes of the numbers that were added up."""
         (values, size), limits = acting(self.loop, self.places, x), self.limits(x)
         radii = np.concatenate([[1.0], self.loop.spread.radii])
+        if self.nominal:
+            values[:, :, 1:] = size[:, :, 1:] = 0.0
         return self.loop.height(self.H @ values) - limits, np.abs(self.H) @ size @ radii + np.abs(limits)
 
     def settled(self, x: Array) -> Array:
@@ -444,7 +447,8 @@ class FeedbackControl(ConstraintSource):
         K, extra = self.places.times.size, np.zeros((self.h.size, self.loop.variables))
         for row, channel in enumerate(np.abs(self.H).argmax(axis=1)):
             extra[row, self.bound + channel * K + place] = -np.abs(self.H[row, channel])
-        return rows_at(self.loop, self.places, place, self.H, self.h, extra)
+        rows = rows_at(self.loop, self.places, place, self.H, self.h, extra)
+        return replace(rows, C=tuple(0.0 * C for C in rows.C), d=0.0 * rows.d) if self.nominal else rows
 
     def worst(self, x: Array) -> Separation:
         """Return the worst row of every place, worst first."""

@@ -1,6 +1,7 @@
 """State of the closed loop at all times: an exact affine function of the deviations.
 
-With the effects ``F`` of the gains, the control on piece ``k`` is ``u_k = v_k + F_k w``, and the state is
+With the effects ``F`` of the gains, the control on piece ``k`` is ``u_k = v_k + F_k w`` (with an `InnerLoop`, plus
+``K_k x(tau_k)``), and the state is
 ``x(t) = x_v(t) + sum_q y_q(t) w_q``. Every response ``y_q`` is the state of the same system from 0, driven by column
 ``q`` of the effects and by its own entry of the disturbance. Where the initial states are a set, the last entries of
 ``w`` are deviations of the initial state, and their responses begin at its unit vectors.
@@ -23,6 +24,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.finite import Spread
 
 if TYPE_CHECKING:
+    from sparserob_core.control.response.inner_loop import InnerLoop
     from sparserob_core.control.response.response import PieceTransitions, TimeGrid
 
 ROUND_OFF = 2.0**-46  # of the numbers that are added up
@@ -81,11 +83,34 @@ class ClosedLoop:
 
     def nominal(self, x: Array) -> Array:
         """Return the nominal control ``(m, K)`` of the decision ``x (n,)``."""
-        return x[: self.nominal_size].reshape(-1, self.functionals.dictionary.pieces)
+        return np.ascontiguousarray(self.controls(x)[:, :, 0].T)
 
     def effects(self, x: Array) -> Array:
         """Return the effects ``F (K, m, Q)`` of the deviations on the control, at the decision ``x (n,)``."""
-        return self.answers.effects(x[self.nominal_size : self.nominal_size + self.answers.variables])
+        return np.ascontiguousarray(self.controls(x)[:, :, 1:])
+
+    def controls(self, x: Array) -> Array:
+        """Return the nominal control and its answers to the deviations on every piece, ``(K, m, 1 + Q)``."""
+        decided, inner = self.decided(x), self.inner
+        if not inner.acts:
+            return decided
+        return np.asarray(decided + inner.gains @ self.path(x)[0][self.firsts])
+
+    def decided(self, x: Array) -> Array:
+        """Return the decided part of `controls`, without what the inner loop adds, ``(K, m, 1 + Q)``."""
+        nominal = x[: self.nominal_size].reshape(-1, self.functionals.dictionary.pieces)
+        effects = self.answers.effects(x[self.nominal_size : self.nominal_size + self.answers.variables])
+        return np.concatenate([nominal.T[:, :, None], effects], axis=2)
+
+    @property
+    def inner(self) -> InnerLoop:
+        """Feedback of the state beside the decision."""
+        return self.functionals.response.inner
+
+    @cached_property
+    def firsts(self) -> np.ndarray:
+        """Piece of the loop's grid with which each piece of the control begins, ``(K,)``."""
+        return np.flatnonzero(np.diff(self.grid.control_piece, prepend=-1) > 0)
 
     def gains(self, x: Array) -> Array:
         """Return the gains ``M (K, K, m, d)`` at the decision ``x (n,)``."""
@@ -93,9 +118,11 @@ class ClosedLoop:
 
     def written(self, x: Array | None) -> dict[str, Array]:
         """Return the arrays of the feedback that are stored in files: its ``gains`` at the decision ``x``, if there is
-        one, and the gains ``(K, d, p)`` of its ``observer``, if outputs are measured."""
-        observer = {} if self.observer is None else {"observer": self.observer.L}
-        return observer if x is None else {"gains": self.gains(x), **observer}
+        one; the gains ``(K, d, p)`` of its ``observer``, if outputs are measured; and the gains ``(K, m, d)`` of its
+        inner loop, ``prestabilise``, if there is one."""
+        fixed = {} if self.observer is None else {"observer": self.observer.L}
+        fixed |= {"prestabilise": self.inner.gains} if self.inner.acts else {}
+        return fixed if x is None else {"gains": self.gains(x), **fixed}
 
     @cached_property
     def motion(self) -> VaryingMotion | None:
@@ -188,13 +215,15 @@ class ClosedLoop:
 
     def inputs(self, x: Array) -> Array:
         """Return the nominal inputs on the pieces of the grid and their responses to the deviations,
-        ``(L, m + mw, 1 + Q)``. The rows are control, drift and disturbance."""
-        grid, m, origin = self.grid, self.answers.shape[1], self.origin
-        nominal = np.concatenate([grid.inputs(self.nominal(x)).T[:, :, None], self.middles[origin, :, None]], axis=1)
+        ``(L, m + mw, 1 + Q)``, without the inner loop. The rows are control, drift and disturbance."""
+        grid, m, origin, decided = self.grid, self.answers.shape[1], self.origin, self.decided(x)
+        nominal = np.concatenate(
+            [grid.inputs(np.ascontiguousarray(decided[:, :, 0].T)).T[:, :, None], self.middles[origin, :, None]], axis=1
+        )
         has_control, entries = grid.control_piece >= 0, self.entries[origin]
         responses = np.zeros((*nominal.shape[:2], entries.shape[2]))
         responses[:, nominal.shape[1] - entries.shape[1] :] = entries
-        responses[has_control, :m] = self.effects(x)[grid.control_piece[has_control]]
+        responses[has_control, :m] = decided[grid.control_piece[has_control], :, 1:]
         return np.concatenate([nominal, responses], axis=2)
 
     def drives(self, x: Array) -> Array:
@@ -223,7 +252,12 @@ class ClosedLoop:
                 Phi, Gamma, step_numbers = motion.flow.state, motion.inputs, motion.every
             nodes = np.zeros((drives.shape[0] + 1, self.start.size, drives.shape[2]))
             nodes[0] = np.column_stack([self.start, self.begins])
+            feedback = np.zeros((0, drives.shape[2]))
             for piece, step in enumerate(step_numbers.tolist()):
+                if self.inner.acts:
+                    if piece in self.firsts:
+                        feedback = self.inner.gains[self.grid.control_piece[piece]] @ nodes[piece]
+                    drives[piece] += self._control_matrices[piece] @ feedback
                 nodes[piece + 1] = Phi[step] @ nodes[piece] + Gamma[step] @ drives[piece]
             while len(self._paths) > 1:
                 self._paths.pop(next(iter(self._paths)))
@@ -236,41 +270,64 @@ class ClosedLoop:
         flow, input_flow = self.compute_flows(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
         return np.asarray(flow @ nodes[pieces] + input_flow @ drives[pieces])
 
-    def bound_rounding_errors(self, x: Array) -> tuple[Array, Array, Array]:
+    def bound_rounding_errors(self, x: Array) -> tuple[Array, Array, Array, Array]:
         """Return bounds under any deviation: of the sizes of the nodes ``(L + 1, d)`` and of what drives them
-        ``(L, ..)``, and of the rounding error of every node.
+        ``(L, ..)``, and of the rounding errors of both.
 
         Each step is allowed an error of `ROUND_OFF` times the absolute numbers that it adds up, and the transitions to
-        the node amplify that. Those of a system that changes with time are counted by its motion.
+        the node amplify that; those with the inner loop, which answers errors as it answers states. Transitions of a
+        system that changes with time are counted by its motion.
         """
         key = x.tobytes()
         if key not in self._rounding_bounds:
             (nodes, drives), radii = self.path(x), np.concatenate([[1.0], self.spread.radii])
             sizes, drive_sizes = np.abs(nodes) @ radii, np.abs(drives) @ radii
-            errors = np.zeros_like(sizes)
+            errors, drive_errors = np.zeros_like(sizes), np.zeros_like(drive_sizes)
             if self.motion is None:
                 Phi, Gamma, step_numbers = (
                     self.steps.Phi[0],
                     self.steps.Gamma[0],
                     self.functionals.response.which,
                 )
-                transitions = np.empty((step_numbers.size, *Phi.shape[1:]))
                 step_errors = np.einsum("kij,kj->ki", np.abs(Phi)[step_numbers], sizes[:-1])
                 step_errors = ROUND_OFF * (
                     step_errors + np.einsum("kij,kj->ki", np.abs(Gamma)[step_numbers], drive_sizes)
                 )
+                d, m = self.start.size, len(self.inner.gains[0]) if self.inner.acts else 0
+                transitions = np.empty((step_numbers.size, d + m, d))
                 for piece, step in enumerate(step_numbers.tolist()):
-                    transitions[:piece] = Phi[step] @ transitions[:piece]
-                    transitions[piece] = np.eye(self.start.size)
-                    errors[piece + 1] = np.einsum(
-                        "kij,kj->i", np.abs(transitions[: piece + 1]), step_errors[: piece + 1]
-                    )
+                    transitions[:piece] = self._augment(piece, Phi[step], Gamma[step]) @ transitions[:piece]
+                    transitions[piece] = np.eye(d + m, d)
+                    bounds = np.einsum("kij,kj->i", np.abs(transitions[: piece + 1]), step_errors[: piece + 1])
+                    errors[piece + 1] = bounds[:d]
+            if self.inner.acts:
+                feedback = np.abs(self.inner.gains) @ errors[self.firsts][:, :, None]
+                drive_errors = (np.abs(self._control_matrices) @ feedback[self.grid.control_piece])[:, :, 0]
             self._rounding_bounds.clear()
-            self._rounding_bounds[key] = sizes, drive_sizes, errors
+            self._rounding_bounds[key] = sizes, drive_sizes, errors, drive_errors
         return self._rounding_bounds[key]
 
+    def _augment(self, piece: int, Phi: Array, Gamma: Array) -> Array:
+        """Return the transition over a piece of the grid of the state and of what the inner loop holds, ``(d + m, d +
+        m)``; that of the state alone without an inner loop."""
+        if not self.inner.acts:
+            return Phi
+        d, m = Phi.shape[0], self._control_matrices.shape[2]
+        hold = np.eye(d + m)
+        if piece in self.firsts:
+            hold[d:] = np.hstack([self.inner.gains[self.grid.control_piece[piece]], np.zeros((m, m))])
+        flow = np.eye(d + m)
+        flow[:d] = np.hstack([Phi, Gamma @ self._control_matrices[piece]])
+        return np.asarray(flow @ hold)
+
     @cached_property
-    def _rounding_bounds(self) -> dict[bytes, tuple[Array, Array, Array]]:
+    def _control_matrices(self) -> Array:
+        """Columns of ``B`` through which the control acts on every piece of the grid, ``(L, d, m)``."""
+        propagator = self.functionals.response.propagator
+        return np.stack([self.inner.matrix(propagator, piece) for piece in range(self.grid.pieces)])
+
+    @cached_property
+    def _rounding_bounds(self) -> dict[bytes, tuple[Array, Array, Array, Array]]:
         return {}
 
     def sizes(self, x: Array, rows: Array) -> Array:
@@ -312,10 +369,6 @@ class ClosedLoop:
     def compute_initial_state(self, deviation: Array) -> Array:
         """Return the initial state ``(d,)`` of a deviation ``(Q,)``."""
         return np.asarray(self.start + self.begins @ deviation)
-
-    def controls(self, x: Array) -> Array:
-        """Return the nominal control and its answers to the deviations on every piece, ``(K, m, 1 + Q)``."""
-        return np.concatenate([self.nominal(x).T[:, :, None], self.effects(x)], axis=2)
 
 
 def deviations_of(

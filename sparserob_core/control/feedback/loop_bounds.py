@@ -62,9 +62,10 @@ class LoopBounds:
         flow, input_flow = self.loop.compute_flows(
             pieces, np.clip(times - self.loop.grid.breakpoints[pieces], 0.0, None)
         )
-        sizes, drive_sizes, errors = self.loop.bound_rounding_errors(x)
+        sizes, drive_sizes, errors, drive_errors = self.loop.bound_rounding_errors(x)
         magnitudes = np.abs(flow) @ sizes[pieces, :, None] + np.abs(input_flow) @ drive_sizes[pieces, :, None]
         rounding_errors = ROUND_OFF * magnitudes + np.abs(flow) @ errors[pieces, :, None]
+        rounding_errors += np.abs(input_flow) @ drive_errors[pieces, :, None]
         return np.asarray(flow @ nodes[pieces] + input_flow @ drives[pieces]), rounding_errors[:, :, 0]
 
     def _bound_chord_errors(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -11,6 +11,9 @@ from scipy.sparse import csr_array
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import Spread, UncertainRows, table_of
+
+if TYPE_CHECKING:
+    from sparserob_core.control.response.inner_loop import Weights
 
 
 @final
@@ -23,8 +26,14 @@ class LoopRows:
     def of_state(self, time: float, H: Array, h: Array, part: np.ndarray, factor: Array) -> UncertainRows:
         """Return the rows ``H x(t) <= h`` at one time as `UncertainRows`. The direction of row ``r`` is ``factor_r``
         times that of the first row of its part, ``part_r``."""
-        count, firsts = H.shape[0], _find_firsts(part)
-        free, weights, on_noise = self.loop.functionals.response.weights(np.full(count, time), H, np.zeros((count, 0)))
+        count = H.shape[0]
+        weights = self.loop.functionals.response.weights(np.full(count, time), H, np.zeros((count, 0)))
+        return self._of_weights(weights, h, part, factor)
+
+    def _of_weights(self, functional: Weights, h: Array, part: np.ndarray, factor: Array) -> UncertainRows:
+        """Return the rows on functionals, given as weights, that are at most ``h (r,)``."""
+        (free, weights, on_noise), firsts = functional, _find_firsts(part)
+        count = len(free)
         on_control = self.loop.functionals.on_decision(weights)  # (r, m K), channel-major
         offset = free @ self.loop.start + self.loop.functionals.given(weights)
         offset = offset + np.einsum("rli,li->r", on_noise, self.loop.middles)
@@ -59,7 +68,26 @@ class LoopRows:
                 (G[first][position // Q] * value, (entry, self.loop.nominal_size + variable)), shape=C.shape
             )
             matrices.append(csr_array(C + response))
-        return replace(rows, g=g, C=tuple(matrices))
+        return self._with_inner(replace(rows, g=g, C=tuple(matrices)), G, pieces)
+
+    def _with_inner(self, rows: UncertainRows, G: Array, pieces: np.ndarray) -> UncertainRows:
+        """Return the rows with ``G K_k x(tau_k)`` added on the left, for the piece ``k`` of each row, ``pieces (r,)``:
+        what the inner loop adds to ``G u_k``."""
+        if not self.loop.inner.acts:
+            return rows
+        controls = np.zeros((len(G), self.loop.functionals.dictionary.pieces, G.shape[1]))
+        controls[np.arange(len(G)), pieces] = G
+        return self.with_controls(rows, controls)
+
+    def with_controls(self, rows: UncertainRows, controls: Array) -> UncertainRows:
+        """Return the rows with ``sum_k W_k K_k x(tau_k)`` added on the left, ``controls (r, K, m)``: what the inner
+        loop adds to ``sum_k W_k u_k``. Rows of one part have the same weights, times their factors."""
+        if not self.loop.inner.acts:
+            return rows
+        functional = self.loop.functionals.response.weigh_controls(controls)
+        added = self._of_weights(functional, np.zeros(len(controls)), rows.part, rows.factor)
+        matrices = tuple(csr_array(C + more) for C, more in zip(rows.C, added.C, strict=True))
+        return replace(rows, g=csr_array(rows.g + added.g), h=rows.h + added.h, C=matrices, d=rows.d + added.d)
 
     def of_control(self, piece: int, H: Array, h: Array, extra: Array | None = None) -> UncertainRows:
         """Return the rows ``H u_k <= h`` on one piece for every deviation; ``extra (r, n)`` is added on the left."""
@@ -76,7 +104,8 @@ class LoopRows:
             rows, columns = np.concatenate([rows, extra_entries[0]]), np.concatenate([columns, extra_entries[1]])
             values = np.concatenate([values, extra[extra_entries]])
         g = table_of(rows, columns, values, (H.shape[0], self.loop.variables))
-        return UncertainRows(g, h, part, factor, tuple(matrices), np.zeros((len(firsts), Q)))
+        uncertain = UncertainRows(g, h, part, factor, tuple(matrices), np.zeros((len(firsts), Q)))
+        return self._with_inner(uncertain, H, np.full(H.shape[0], piece))
 
     def _tabulate_responses(self, entry: np.ndarray, variable: np.ndarray, values: Array) -> csr_array:
         """Return the matrix ``(Q, n)`` of ``values (k,)`` by which entries of a deviation respond to variables of the

@@ -52,7 +52,7 @@ class Sampled:
         """Return the rows of constraints ``H x(t) <= h``, each given as ``(H, h, times)``, for the control and the
         disturbances of a loop."""
         blocks: list[tuple[np.ndarray, ...]] = []
-        response, K = loop.functionals.response, loop.functionals.dictionary.pieces
+        response, K = loop.functionals.response.bare, loop.functionals.dictionary.pieces
         for number, (H, h, times) in enumerate(constraints):
             if not H.shape[0] or not times.size:
                 continue

@@ -7,7 +7,7 @@ from typing import Literal, final
 import numpy as np
 from pydantic import Field
 
-from sparserob_core.control.policies.policy import Charge, Policy, Quantity
+from sparserob_core.control.policies.policy import Charge, InnerGain, Policy, Quantity
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
 
@@ -43,6 +43,11 @@ class AffinePolicy(Policy, Options):
     memory: float | None = Field(default=None, ge=0.0)
     """An innovation is answered for so long at most, in the time unit of the problem; everything by default."""
 
+    prestabilise: Literal["auto"] | list[list[float]] | None = None
+    """A gain ``K (m, n)`` of the measured state, for plants that amplify: ``u_k = K x(tau_k) + v_k + sum_j M_kj e_j``.
+    The policies are the same (with ``memory`` other ones), and all numbers are those of the plant under this feedback.
+    ``auto``: the gains of a regulator, one for every piece. null: none."""
+
     causal_signals: int = Field(default=40, ge=0, le=1000)
     """A bound against every causal policy is sought with a tree of the signals of the disturbance that the policy's own
     bound rests on, and so many more at most; 0: none is sought."""
@@ -63,6 +68,11 @@ class AffinePolicy(Policy, Options):
         oldest = np.inf if self.memory is None else self.memory + SAME * breakpoints[-1]
         answered: np.ndarray = np.tril(starts[:, None] - starts <= oldest)
         return answered
+
+    @property
+    def inner_gain(self) -> InnerGain:
+        """The gain of the state, as the option ``prestabilise`` gives it."""
+        return self.prestabilise
 
     @property
     def charge(self) -> Charge:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias, final
 
 import numpy as np
+import numpy.typing as npt
 
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.errors import InputError
@@ -16,6 +17,7 @@ from sparserob_core.sip.convex_set import Array
 
 Quantity: TypeAlias = Literal["state", "disturbance", "parameters"]
 Cost: TypeAlias = Literal["nominal", "peak", "worst"]
+InnerGain: TypeAlias = Literal["auto"] | npt.ArrayLike | None
 
 MAX_ANSWERING = 2**13
 """Pieces of a control that answers what is measured: what each of them may answer are so many squared, 67 million, of
@@ -71,6 +73,12 @@ class Policy(ABC):
         """The cost by which the policy is chosen: the cost of the nominal control unless a policy overrides it."""
         return Charge()
 
+    @property
+    def inner_gain(self) -> InnerGain:
+        """The gain ``(m, d)``, or ``(K, m, d)`` for every piece, of a feedback of the state that acts beside the
+        answers; ``auto`` for one that stabilises the plant, ``None`` for none."""
+        return None
+
 
 @final
 class OpenLoop(Policy, Options):
@@ -85,10 +93,10 @@ class OpenLoop(Policy, Options):
 @final
 class WrittenPolicy(Policy):
     """A policy that is read from the files of a run: the truth values ``mask (K, K)`` and the cost, without the
-    component that gave them."""
+    component that gave them; and the gains ``(K, m, d)`` of its inner loop, if there is one."""
 
-    def __init__(self, mask: np.ndarray, charge: Charge) -> None:
-        self.mask, self._charge = mask, charge
+    def __init__(self, mask: np.ndarray, charge: Charge, inner_gain: Array | None = None) -> None:
+        self.mask, self._charge, self._inner_gain = mask, charge, inner_gain
 
     @property
     def knows(self) -> frozenset[Quantity]:
@@ -103,6 +111,11 @@ class WrittenPolicy(Policy):
     def charge(self) -> Charge:
         """The cost that is written."""
         return self._charge
+
+    @property
+    def inner_gain(self) -> InnerGain:
+        """The gains that are written."""
+        return self._inner_gain
 
 
 def answers_of(policy: Policy | None, breakpoints: Array, measured: Measurements | None = None) -> np.ndarray:

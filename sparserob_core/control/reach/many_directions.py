@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
 from sparserob_core.control.reach.functional import CHUNK, WorstFunctionals
-from sparserob_core.control.response.response import Weights
+from sparserob_core.control.response.inner_loop import Weights
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
 

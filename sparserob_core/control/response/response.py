@@ -9,10 +9,9 @@ On every piece of the merged time grid the inputs are constant, so the state fol
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.flows import FEW_STATES, DoublingExponentials, Exponentials
 from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.problem.system import System
+from sparserob_core.control.response.inner_loop import NO_INNER_LOOP, InnerLoop, Weights
 from sparserob_core.control.response.orbit import Orbit
 from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.control.response.varying.spread import ParameterParts, law_of
@@ -252,16 +252,6 @@ class PieceTransitions:
         """Matrices ``[Gamma, Phi] (v, q, d, 2 d)``, for weights of a row on the forcing in every direction of the
         state."""
         return np.concatenate([self.Gamma, self.Phi], axis=-1)
-
-
-class Weights(NamedTuple):
-    """Functionals ``c'x(t)`` of ``k`` indices as weights: ``free (k, d)`` on the initial state, ``control (k, L, m)``
-    on the inputs through the columns of ``B`` on every piece, and ``disturbance (k, L, mw)`` on those through the
-    columns of ``E``."""
-
-    free: Array
-    control: Array
-    disturbance: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -689,6 +679,14 @@ class Propagator:
         propagated, integrated = ((rows[:, None] @ flow[case_indices.reshape(-1)])[:, 0] for flow in flows)
         return propagated, integrated
 
+    def weigh_part(self, pieces: np.ndarray, directions: Array, within: Array) -> tuple[Array, Array]:
+        """Return the weights of functionals ``c'x``, ``directions (k, d)``, at times ``within (k,)`` their ``pieces
+        (k,)``: on the state at the beginning of the piece, ``(k, d)``, and on the inputs on it, ``(k, m + mw)``. Only
+        for a known system."""
+        steps, none = self.steps(np.zeros((1, 0))), np.zeros(pieces.size, dtype=int)
+        rows, integrated = self._propagate_within_pieces(steps, none, pieces, directions, within)
+        return rows, (integrated[:, None] @ steps.inputs[0, self.grid.modes[pieces]])[:, 0]
+
     def aged(self, parameters: int) -> bool:
         """Return whether the weights on a piece depend only on its age, with so many ``parameters``."""
         return not parameters and self.uniform
@@ -993,7 +991,8 @@ class Response:
     """Responses of one system on one time grid, from one initial state ``(d,)``.
 
     Everything that does not depend on the initial state is in the ``propagator``, which responses from other initial
-    states (`from_state`) share.
+    states (`from_state`) share. With an ``inner`` loop, the control whose weights and states these are is what is
+    decided beside that feedback; `steps` and `flows` are those of the system alone.
     """
 
     system: System
@@ -1001,6 +1000,7 @@ class Response:
     initial_state: Array
     propagate: Exponentials | None = None
     shared: Propagator | None = field(default=None, repr=False)
+    inner: InnerLoop = NO_INNER_LOOP
 
     @cached_property
     def propagator(self) -> Propagator:
@@ -1013,7 +1013,12 @@ class Response:
     @shaped
     def from_state(self, initial_state: Float[Array, " d"]) -> Response:
         """Return the responses of the same system from another initial state ``(d,)``."""
-        return Response(self.system, self.grid, initial_state, self.propagate, self.propagator)
+        return Response(self.system, self.grid, initial_state, self.propagate, self.propagator, self.inner)
+
+    @cached_property
+    def bare(self) -> Response:
+        """Responses of the same system without the inner loop."""
+        return replace(self, inner=NO_INNER_LOOP, shared=self.propagator) if self.inner.acts else self
 
     @shaped
     def at(self, parameter: Float[Array, " nu"]) -> Response:
@@ -1039,7 +1044,11 @@ class Response:
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
     ) -> Weights:
         """Return functionals as weights on the initial state and on inputs (`Propagator.weights`)."""
-        return self.propagator.weights(times, directions, parameters)
+        return self.inner.weights(self.propagator, times, directions, parameters)
+
+    def weigh_controls(self, controls: Array) -> Weights:
+        """Return functionals of what the inner loop adds to the control (`InnerLoop.weigh_controls`)."""
+        return self.inner.weigh_controls(self.propagator, controls)
 
     def numbers(self, parameters: int) -> int:
         """Return how many numbers `weights` holds at once for one index, with so many ``parameters``."""
@@ -1084,6 +1093,8 @@ class Response:
             drive = drive + self.grid.driven(steps.E, disturbance[:, :, self.grid.disturbance_piece])
         path = np.empty((count, self.grid.pieces + 1, self.initial_state.size))
         path[:, 0] = self.initial_state if deviations is None else self.initial_state + deviations
+        if self.inner.acts:
+            return self.inner.states(self.propagator, path[:, 0], np.broadcast_to(drive, (count, *drive.shape[1:])))
         shared, lengths = steps.Phi.shape[0] == 1, self.which.tolist()
 
         def multiply(matrices: Array, vectors: Array) -> Array:
@@ -1117,8 +1128,8 @@ class Response:
 
     @cached_property
     def orbit(self) -> Orbit | None:
-        """The states of a plant that grows by much, in more digits; ``None`` for others."""
-        orbit = self.propagator.orbit
+        """The states of a plant that grows by much, in more digits; ``None`` for others, and beside an inner loop."""
+        orbit = None if self.inner.acts else self.propagator.orbit
         return None if orbit is None else orbit.from_state(self.initial_state)
 
     @cached_property

@@ -29,7 +29,7 @@ class Measuring:
     model : Transcription
         The problem.
     nominal : ndarray, shape (m, K)
-        Nominal control.
+        Nominal control; with an inner loop its decided part.
     gains : ndarray, shape (K, K, m, p)
         Gains of the innovations.
     noises : ndarray, shape (K, p, n), optional
@@ -47,7 +47,9 @@ class Measuring:
     @staticmethod
     def of(model: Transcription, decision: Array, noises: Array | None = None) -> Measuring:
         """Return the control of a decision."""
-        return Measuring(model, model.pieces(decision), model.answering.loop.gains(decision), noises)
+        loop = model.answering.loop
+        nominal = np.ascontiguousarray(loop.decided(decision)[:, :, 0].T)
+        return Measuring(model, nominal, loop.gains(decision), noises)
 
     def list_innovations(self, measured: Array) -> list[Array]:
         """Return all innovations ``(p,)`` so far, if ``measured (p,)`` is the measurement as the next piece begins,
@@ -112,6 +114,8 @@ class Measuring:
             now, predicted = measured(k), self._predict_states()
             self._innovations.append(self._compute_innovations(now, predicted))
             u = np.repeat(self.nominal[:, k, None], now.shape[1], axis=1)
+            if loop.inner.acts:
+                u = u + loop.inner.gains[k] @ now
             for j, innovation in enumerate(self._innovations):
                 if self.gains[k, j].any():
                     u = u + self.gains[k, j] @ innovation

@@ -9,6 +9,7 @@ from functools import reduce
 from typing import final
 
 import numpy as np
+import numpy.typing as npt
 
 from sparserob_core.control.constraints.control import STEP, Places, held_at, of_control
 from sparserob_core.control.constraints.effort import FeedbackEffort
@@ -19,11 +20,14 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.feedback.closed_loop import ClosedLoop, deviations_of
 from sparserob_core.control.feedback.innovations import Answers, answers, build_innovations, find_negligible_entries
 from sparserob_core.control.feedback.observer import Observer, between, innovations_of
-from sparserob_core.control.policies.policy import Charge, Policy
+from sparserob_core.control.feedback.prestabilised import SampledPlant, StateRows
+from sparserob_core.control.policies.policy import Charge, InnerGain, Policy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.problem.terms.windows import end_of
 from sparserob_core.control.problem.units import Units, power_of_two
-from sparserob_core.control.reach.sizes import widths
+from sparserob_core.control.reach.sizes import widths as widths_of
+from sparserob_core.control.response.inner_loop import InnerLoop
 from sparserob_core.control.transcription.own_units import added_up, constraint_sides, fixed, units_of_steps
 from sparserob_core.control.transcription.program import EQUALS, ranges, transcribed
 from sparserob_core.control.transcription.provable import hindrance
@@ -131,8 +135,14 @@ class FeedbackModel(Acting):
         answers, deviations = self.measurements.answers, self.measurements.deviations
         assert deviations is not None
         peaks = np.repeat(units.controls, own.control.pieces)
-        charged = {"nominal": peaks[:0], "peak": peaks, "worst": np.full(1, units.cost)}[self.charge.cost]
+        of_nominal = peaks if own.response.inner.acts else peaks[:0]
+        charged = {"nominal": of_nominal, "peak": peaks, "worst": np.full(1, units.cost)}[self.charge.cost]
         return np.concatenate([units.controls[answers.channel] / deviations[answers.entry], charged])
+
+    def _count_charged(self, nominal: int, acts: bool) -> int:
+        """Return the number of variables that bound what is charged, for so many ``nominal`` entries of the control.
+        Where an inner loop ``acts``, the nominal control is no entry of the decision, and is bounded by variables."""
+        return {"nominal": nominal * acts, "peak": nominal, "worst": 1}[self.charge.cost]
 
     def part(self, posed: Posed) -> ProgramPart:
         """Return the families that hold for every deviation, the gains with their bounds, and the variables that bound
@@ -140,7 +150,7 @@ class FeedbackModel(Acting):
         functionals, problem, pieces = posed.functionals, posed.problem, posed.control.pieces
         measurements, gains, charge = self.measurements, self.measurements.answers, self.charge
         nominal, first = functionals.variables, functionals.variables + gains.variables
-        size = first + {"nominal": 0, "peak": nominal, "worst": 1}[charge.cost]
+        size = first + self._count_charged(nominal, functionals.response.inner.acts)
         loop = ClosedLoop(
             functionals,
             gains,
@@ -170,14 +180,16 @@ class FeedbackModel(Acting):
                 H, h = H / measurements.steps[:, None], h / measurements.steps
             families.append(FeedbackControl(name, loop, places, H, h).family())
         axes, (low, high) = np.eye(problem.system.controls), ranges(problem.control)
-        gain_bounds = gains.share * (high - low)[gains.channel] / loop.spread.chords[gains.entry]
+        widths = np.subtract(*reversed(ranges(posed.held.control)))
+        gain_bounds = gains.share * widths[gains.channel] / loop.spread.chords[gains.entry]
         magnitudes = np.repeat(np.maximum(np.abs(low), np.abs(high)), pieces)
         lower, upper, weights, largest = -gain_bounds, gain_bounds, None, None
         prices, peak = problem.prices(breakpoints).ravel(), replace(self, charge=replace(charge, cost="peak"))
         guide, among = None, None
-        if charge.cost == "peak":
+        if charge.cost == "peak" or (charge.cost == "nominal" and loop.inner.acts):
             directions, all_places = np.vstack([axes, -axes]), Places.of_values(breakpoints, len(axes))
-            peaks = FeedbackControl(PEAK, loop, all_places, directions, np.zeros(len(directions)), first)
+            limits, is_nominal = np.zeros(len(directions)), charge.cost == "nominal"
+            peaks = FeedbackControl(PEAK, loop, all_places, directions, limits, first, nominal=is_nominal)
             families.append(peaks.family())
             settle_functions.append(peaks.settled)
             weights = np.concatenate([np.zeros(first), prices])
@@ -193,7 +205,10 @@ class FeedbackModel(Acting):
         elif charge.among == "peak" and problem.cost.is_linear:
             among = (transcribed(posed, peak).program, first)
         return ProgramPart(
-            families=[replace(family, hindrance=lambda low, high: hindrance(system, horizon)) for family in families],
+            families=[
+                replace(family, hindrance=lambda low, high: "" if loop.inner.acts else hindrance(system, horizon))
+                for family in families
+            ],
             lower=lower,
             upper=upper,
             weights=weights,
@@ -307,6 +322,95 @@ def refuse(
             raise InputError(f"feedback needs a {wanted}", path="policy.name")
 
 
+def build_inner_loop(
+    wanted: InnerGain, rough: Posed, problem: OptimalControlProblem, states: int, units: Units
+) -> InnerLoop:
+    """Return the inner loop that a policy wants for a problem, in the units of the problem.
+
+    Parameters
+    ----------
+    wanted : InnerGain
+        Gains as the policy gives them, or ``auto``.
+    rough : Posed
+        Problem in the ``units``, without an inner loop.
+    problem : OptimalControlProblem
+        Problem in its own units.
+    states : int
+        Number of states that are measured; they come first.
+    units : Units
+        Units of ``rough``.
+
+    Raises
+    ------
+    InputError
+        Where the gains are no such numbers, or the problem has what an inner loop is not built for.
+    """
+    _refuse_inner_loop(problem)
+    (K, m, d), scaled = (rough.control.pieces, problem.system.controls, problem.system.states), rough.problem
+    low, high = (np.zeros(scaled.system.disturbances),) * 2
+    if scaled.disturbance is not None:
+        low, high = ranges(scaled.disturbance)
+    plant = SampledPlant.of(rough.response, rough.control, low, high)
+    gains = np.zeros((K, m, d))
+    if wanted is None or isinstance(wanted, str):
+        rows = _normalise_rows(rough.constraints, d)[:, :states]
+        lengths = rough.control.lengths / scaled.horizon
+        measured = replace(plant, Phi=plant.Phi[:, :states, :states], Gamma=plant.Gamma[:, :states])
+        gains[:, :, :states] = measured.regulator(rows, scaled.control.reach(np.eye(m)), lengths)
+    else:
+        gains[:, :, :states] = _read_gains(wanted, (K, m, states)) * units.states[:states] / units.controls[:, None]
+    initial = np.asarray(scaled.initial_state, dtype=float)
+    around = np.zeros((2, d)) if scaled.initial_set is None else np.array(ranges(scaled.initial_set))
+    times = rough.control.breakpoints
+    windows = [(entry.set, entry.start, end_of(entry.stop, scaled.horizon))
+               for entry in scaled.of_states if entry.relative_to is None]  # fmt: skip
+    windows += [(end, scaled.horizon, scaled.horizon) for end in scaled.ends]
+    constraints = [
+        StateRows(*_find_sides(convex), (times >= start) & (times <= stop)) for convex, start, stop in windows
+    ]
+    reach = plant.bound(gains, (initial + around[0], initial + around[1]), ranges(scaled.control), constraints)
+    return InnerLoop(gains * units.controls[:, None] / units.states, reach * units.controls)
+
+
+def _read_gains(wanted: npt.ArrayLike, shape: tuple[int, int, int]) -> Array:
+    """Return gains ``(K, m, d)`` after a check; one matrix is that of every piece."""
+    _, m, d = shape
+    try:
+        gains = np.array(wanted, dtype=float)
+    except (TypeError, ValueError):
+        gains = np.zeros(0)
+    if gains.shape not in ((m, d), shape) or not np.isfinite(gains).all():
+        got = f"{wanted!r}" if gains.ndim < 2 else f"an array of shape {gains.shape}"
+        got = got if np.isfinite(gains).all() else "a number that is not finite"
+        expected = f"auto, or {m} rows of {d} finite numbers: a row per control, a number per state"
+        raise InputError(path="policy.prestabilise", expected=expected, got=got)
+    return np.broadcast_to(gains, shape)
+
+
+def _find_sides(convex: ConvexSet) -> tuple[Array, Array, Array]:
+    """Return directions ``(r, d)`` along which a set is bounded on both sides, and the least and largest values there:
+    normals of its sides, or the axes where it is curved."""
+    flat = convex.halfspaces()
+    directions = np.eye(convex.dimension) if flat is None else flat[0]
+    low, high = -convex.support(-directions), convex.support(directions)
+    is_bounded = np.isfinite(low) & np.isfinite(high)
+    return directions[is_bounded], low[is_bounded], high[is_bounded]
+
+
+def _refuse_inner_loop(problem: OptimalControlProblem) -> None:
+    """Raise `InputError` for what an inner loop is not built for, in one sentence."""
+    reasons = {
+        "a plant that does not change with time": problem.system.varies,
+        "a control without delay": problem.system.delay > 0.0,
+        "states that are measured at once and without noise": problem.measurements is not None,
+        "a cost without quadratic terms and groups": not problem.cost.is_linear or bool(problem.cost.blocks),
+        "a plan that does not repeat": bool(problem.repeat),
+    }
+    for wanted, hindered in reasons.items():
+        if hindered:
+            raise InputError(f"an inner loop needs {wanted}; null does without", path="policy.prestabilise")
+
+
 def _has_zero_chord(convex: ConvexSet) -> bool:
     """Return whether a set has no length along an axis through its middle although its entry on this axis deviates.
     Then no gain on that entry of a deviation is bounded."""
@@ -379,7 +483,7 @@ def _normalise_rows(constraints: Sequence[StateConstraint], d: int) -> Array:
     for constraint in constraints:
         assert constraint.sides is not None
         H, h = constraint_sides(constraint)
-        width = widths(H, h)
+        width = widths_of(H, h)
         sizes = np.maximum(np.abs(h), np.where(np.isfinite(width), width, 0.0))
         rows.append(constraint.sides[0] / np.where(sizes > 0.0, sizes, 1.0)[:, None])
     return np.vstack(rows)

@@ -20,6 +20,7 @@ from sparserob_core.control.problem.units import Units, power_of_two, ratios
 from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.sizes import nominal_sizes
 from sparserob_core.control.response.disturbance import DisturbanceModel
+from sparserob_core.control.response.inner_loop import InnerLoop
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.transcription.objective import objective, quadratics
 from sparserob_core.control.transcription.own_units import (
@@ -175,11 +176,12 @@ def final_errors(posed: Posed) -> Callable[[Array], EqualityErrors]:
     return errors
 
 
-def held_nominally(problem: OptimalControlProblem) -> OptimalControlProblem:
+def held_nominally(problem: OptimalControlProblem, inner: InnerLoop) -> OptimalControlProblem:
     """Return a problem in which the ranges of the controls are the only bounds of the control, and terminal sets
     without equalities the only ones of the final state. All other requirements on a control that answers hold for every
-    deviation."""
-    ranged = Box(*ranges(problem.control))
+    deviation. Beside an ``inner`` loop the decided part of the control has a wider range."""
+    low, high = ranges(problem.control)
+    ranged = Box(low - inner.reach, high + inner.reach) if inner.acts else Box(low, high)
     return replace(problem, control=ranged, control_step=None, terminal=problem.terminal_sets)
 
 

@@ -109,5 +109,5 @@ def hindrance(system: System, horizon: float) -> str:
     size = f"e^{exponent:.0f} = {np.exp(min(exponent, 700.0)):.1g}"
     return (
         f"the plant amplifies by {size} over the horizon, and double precision resolves {np.finfo(float).eps:.0e} of"
-        " that; a shorter horizon, wider sets, or feedback on a plant that is stabilised before would help"
+        " that; a shorter horizon, wider sets, or feedback with policy.prestabilise: auto would help"
     )

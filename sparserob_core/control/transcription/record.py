@@ -215,7 +215,9 @@ class Transcription(Posed):
 
     def pieces(self, theta: Array) -> Array:
         """Return the control ``(m, K)`` on the pieces of its dictionary, of a decision ``theta (m, N)`` or ``(m N,)``;
-        under feedback the nominal control."""
+        under feedback the nominal control, which a whole decision gives."""
+        if self.feedback is not None and self.feedback.loop.inner.acts:
+            return self.feedback.loop.nominal(np.asarray(theta, dtype=float))
         return self.control.control(self.nominal(theta))
 
     def nominal(self, decision: Array) -> Array:

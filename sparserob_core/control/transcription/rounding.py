@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from sparserob_core.control.enclosures.decoupling import pace
-from sparserob_core.control.response.response import Weights
+from sparserob_core.control.response.inner_loop import Weights
 from sparserob_core.control.transcription.own_units import extent, fixed
 from sparserob_core.control.transcription.program import slanted
 from sparserob_core.control.transcription.record import Transcription

@@ -18,6 +18,7 @@ from sparserob_core.control.problem.terms.windows import MixedConstraint, PathCo
 from sparserob_core.control.problem.units import Units, ratios
 from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
+from sparserob_core.control.response.inner_loop import NO_INNER_LOOP, InnerLoop
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.response.response import SAME_TIME, Response, distinct_times
@@ -120,7 +121,7 @@ def prepare(
     if problem.execution is not None and mask.any():
         expected = "none under feedback, where the size of the control, and with it that of its error, answers too"
         raise InputError(path="execution", expected=expected, got=f"{np.asarray(problem.execution).tolist()}")
-    nominal_problem = problem
+    nominal_problem, inner = problem, NO_INNER_LOOP
     if policy is not None and mask.any():
         from sparserob_core.control.transcription import feedback
 
@@ -130,8 +131,9 @@ def prepare(
             raise InputError(
                 f"formulation: expected reduced with a policy that answers what is measured, got {formulation!r}"
             )
-        nominal_problem = held_nominally(problem)
-    posed = _pose_problem(problem, nominal_problem, control, disturbance)
+        inner = _build_inner_loop(policy, problem, user_problem.system.states, control, disturbance)
+        nominal_problem = held_nominally(problem, inner)
+    posed = _pose_problem(problem, nominal_problem, control, disturbance, inner)
     own = cache(lambda: _scale_to_own_units(posed))
     acting: Acting = OpenLoopModel(formulation)
     if policy is not None and mask.any():
@@ -159,15 +161,35 @@ def _merge_disturbance_grids(
     return replace(problem, disturbance_breakpoints=own), Dictionary.indicators(joint)
 
 
+def _build_inner_loop(
+    policy: Policy, problem: OptimalControlProblem, states: int, control: Dictionary, disturbance: Dictionary
+) -> InnerLoop:
+    """Return the inner loop of a policy for a problem, in the units of the problem. Only the first ``states`` states
+    are measured."""
+    from sparserob_core.control.transcription import feedback
+
+    if policy.inner_gain is None:
+        return NO_INNER_LOOP
+    units = rough_units(problem)
+    rough, control, disturbance = (
+        units.of_problem(problem),
+        units.of_dictionary(control),
+        units.of_dictionary(disturbance),
+    )
+    posed = _pose_problem(rough, rough, control, disturbance, NO_INNER_LOOP)
+    return feedback.build_inner_loop(policy.inner_gain, posed, problem, states, units)
+
+
 def _build_functionals(
-    problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary
+    problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary, inner: InnerLoop
 ) -> tuple[WorstFunctionals, ParameterIndex]:
     system, grid = problem.system.forced, grid_of(problem, control.breakpoints, disturbance.breakpoints)
     model: DisturbanceModel | None = None
     if problem.disturbance is not None:
         bound, breakpoints = problem.disturbance, problem.disturbance_breakpoints
         model = disturbance_model(problem.disturbance_class, bound, disturbance, grid, breakpoints)
-    response, initial_set = Response(system, grid, np.asarray(problem.initial_state, dtype=float)), problem.initial_set
+    response = Response(system, grid, np.asarray(problem.initial_state, dtype=float), inner=inner)
+    initial_set = problem.initial_set
     execution = None
     if problem.execution is not None:
         from sparserob_core.control.reach.varying_execution import execution_of
@@ -182,11 +204,15 @@ def _build_functionals(
 
 
 def _pose_problem(
-    problem: OptimalControlProblem, held: OptimalControlProblem, control: Dictionary, disturbance: Dictionary
+    problem: OptimalControlProblem,
+    held: OptimalControlProblem,
+    control: Dictionary,
+    disturbance: Dictionary,
+    inner: InnerLoop,
 ) -> Posed:
-    """Return a problem on its dictionaries, in its units; ``held`` is the part that becomes rows of the nominal
-    decision."""
-    functionals, parameters = _build_functionals(problem, control, disturbance)
+    """Return a problem on its dictionaries, in its units, with an ``inner`` loop; ``held`` is the part that becomes
+    rows of the nominal decision."""
+    functionals, parameters = _build_functionals(problem, control, disturbance, inner)
     return Posed(
         problem=problem,
         held=held,
@@ -230,12 +256,15 @@ def _scale_to_shares(posed: Posed, shares: Array) -> tuple[Posed, Units]:
     ranged = problem if (shares == 1.0).all() else ranged
     rough, dictionaries = rough_units(ranged), (posed.control, posed.disturbance)
     rough_problem = rough.of_problem(ranged)
-    reaching, _ = _build_functionals(rough_problem, *(rough.of_dictionary(dictionary) for dictionary in dictionaries))
+    rough_control, rough_disturbance = (rough.of_dictionary(dictionary) for dictionary in dictionaries)
+    rough_inner = posed.response.inner.in_units(rough)
+    reaching, _ = _build_functionals(rough_problem, rough_control, rough_disturbance, rough_inner)
     units = own_units(ranged, rough, reaching, rough_problem.control)
     control, disturbance = (units.of_dictionary(dictionary) for dictionary in dictionaries)
     scaled = units.of_problem(problem)
-    nominal_problem = scaled if posed.held is problem else held_nominally(scaled)
-    own = _pose_problem(scaled, nominal_problem, control, disturbance)
+    inner = posed.response.inner.in_units(units)
+    nominal_problem = scaled if posed.held is problem else held_nominally(scaled, inner)
+    own = _pose_problem(scaled, nominal_problem, control, disturbance, inner)
     control_range, held_range = (variant.control.in_units(1.0 / shares) for variant in (scaled, nominal_problem))
     constraints = tuple(constraint.divided(row_units(constraint, control_range)) for constraint in own.constraints)
     return replace(own, constraints=constraints, rows=held_units(own, held_range)), units
@@ -262,7 +291,7 @@ def _transcribe_in_own_units(model: Transcription, posed: Posed, units: Units) -
 def like(own: Transcription, problem: OptimalControlProblem) -> SemiInfiniteProgram:
     """Return the program of another problem on the dictionaries of ``own``, with the row units and the explanations of
     ``own``. The two problems may differ only in numbers on the right-hand sides."""
-    posed = _pose_problem(problem, problem, own.control, own.disturbance)
+    posed = _pose_problem(problem, problem, own.control, own.disturbance, own.response.inner)
     pairs = zip(posed.constraints, own.constraints, strict=True)
     constraints = tuple(
         constraint.divided(_compute_row_ratios(constraint, own_constraint)) for constraint, own_constraint in pairs

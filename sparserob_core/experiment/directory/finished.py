@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 UNFINISHED = "the run has not finished"
 NUMBERS = ("cost", "value", "epsilon", "lower_bound", "upper_bound", "gap", "seconds")
-ANSWERS = ("gains", "observer")  # arrays of a feedback decision: gains, and the observer where outputs are measured
+# arrays of a feedback decision: gains, the observer where outputs are measured, and the gains of an inner loop
+ANSWERS = ("gains", "observer", "prestabilise")
 SAME = 1e-9  # difference that is allowed between dependent arrays, as a share of the largest number of the array
 MAX_TEXT = 2**27
 """Largest number of bytes of a JSON file. The largest that runs write have some 10 million; with ten times the limit a

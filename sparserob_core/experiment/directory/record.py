@@ -144,15 +144,14 @@ def _report_worst(worst: WorstConstraint | None, states: int | None) -> dict[str
     }
 
 
-def control_of(result: Result, program: SemiInfiniteProgram, dictionary: Dictionary | None) -> Array | None:
-    """Return the control ``(m, K)`` on every piece of the dictionary.
+def control_of(result: Result, model: Transcription | None) -> Array | None:
+    """Return the control ``(m, K)`` on every piece of the dictionary; under feedback the nominal one.
 
     Returns ``None`` without a decision, and for a program of another kind.
     """
-    if result.decision is None or dictionary is None:
+    if result.decision is None or model is None:
         return None
-    theta = _extract_nominal(result.decision, program, dictionary)
-    return dictionary.control(theta)
+    return model.pieces(np.asarray(result.decision))
 
 
 def _extract_nominal(decision: Array | None, program: SemiInfiniteProgram, dictionary: Dictionary) -> Array:

@@ -72,6 +72,8 @@ def initial_states(
             expected="false, since a plan that repeats ends among its initial states, and not from elsewhere",
             got="true",
         )
+    if model.response.inner.acts:
+        raise InputError(path="policy.prestabilise", expected="null for initial states", got="an inner loop")
     if about is not None:
         added_states = np.asarray(model.problem.initial_state, dtype=float)[model.stated.system.states :]
         model = from_state(model, np.append(_check_about(about, model.stated), added_states))

@@ -50,7 +50,7 @@ class Journal(Observer):
 
     def record(self, result: Result) -> tuple[Array | None, dict[str, Any]]:
         """Write ``result.json``; returns the control ``(m, K)`` and the contents of the file."""
-        control = control_of(result, self.experiment.program, self._dictionary)
+        control = control_of(result, self.experiment.model)
         config = self.experiment.loaded.config
         summary = {
             "title": self.experiment.title,

@@ -239,8 +239,7 @@ class SolvedProblem(ControlResult):
         from sparserob_core.experiment.run.drawing import picture
         from sparserob_core.experiment.terminal.notebook import page
 
-        dictionary = self.model.control
-        summary = summary_of(self, control_of(self, self.model.program, dictionary), self.model)
+        summary = summary_of(self, control_of(self, self.model), self.model)
         title = self.problem.title or "Result"
         try:
             drawn = picture(self.experiment, self)

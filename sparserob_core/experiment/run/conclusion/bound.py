@@ -63,9 +63,10 @@ def _derive_bound(experiment: ControlExperiment, result: Result, deadline: Deadl
     these bounds may be all that keeps the gap open. The bound is then derived from the same multipliers in ball
     arithmetic, which omits no rounding error, nor any in the rows.
 
-    Ball arithmetic is also used in two cases in which running bounds omit an error. The first: support points of sets
+    Ball arithmetic is also used in three cases in which running bounds omit an error. The first: support points of sets
     that are no boxes give the worst deviations of a policy. No running bound has the error of these points. The second:
-    there are errors of execution, whose integrals a running bound estimates by shares. No other bound is reported in
+    there are errors of execution, whose integrals a running bound estimates by shares. The third: an inner loop acts
+    beside the decision, and the rows of a running bound are those of the plant with it. No other bound is reported in
     these cases, however long it takes. Raises `sparserob_core.sip.limits.deadline.OutOfTime` where the time of the run
     is over before.
     """
@@ -75,7 +76,9 @@ def _derive_bound(experiment: ControlExperiment, result: Result, deadline: Deadl
     if result.status not in ("certified", "verified") or tolerance is None or result.stopped:
         return rounded
     feedback = experiment.transcription.feedback
-    exact = experiment.problem.execution is None and (feedback is None or feedback.loop.spread.is_box)
+    exact = experiment.problem.execution is None and (
+        feedback is None or (feedback.loop.spread.is_box and not feedback.loop.inner.acts)
+    )
     if exact and rounded.gap <= tolerance + SMALL_GAP:
         return rounded
     data = certificate(experiment, rounded)

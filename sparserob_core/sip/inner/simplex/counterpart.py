@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, final
 
 import numpy as np
+from scipy.optimize import lsq_linear
 from scipy.sparse import csc_array, csr_array, diags_array, vstack
 
 from sparserob_core.errors import PluginError, named
@@ -55,6 +56,7 @@ LARGE = 200_000
 # as so many. With ten times as many one round took more than a minute; with a tenth of them small rounds begin anew.
 PATIENT = 0.25
 ROBUST = "feedback"  # what these programs are called where a solver fails on some
+PASSES = 20  # of least squares within bounds, at most: what is left of a slope after some lowers a bound, which holds
 INNER = 20  # steps of the simplex method that one of an interior point method takes as long as
 SAME = 1e-12  # points of a set that are closer are one
 DRAWN = (
@@ -309,6 +311,9 @@ class Counterpart:
         """Return the multipliers ``(r,)`` of all rows, and the deviations ``(r, Q)`` that those of the parts stand
         for."""
         y, deviations = self._read_multipliers(even)
+        priced = self.program if touched is None else self.program.tangent(touched)
+        if not (self.elastic or self.scales or any(block.exact for block in self.blocks)):
+            self._refine_multipliers(mu @ self.program.A + priced.q, priced.weights, y)
         terms = [(np.zeros(0, dtype=int), np.zeros(0))]
         late: list[tuple[UncertainRows, int, _Part, np.ndarray, float]] = []
         first = 0
@@ -337,10 +342,10 @@ class Counterpart:
                 deviations[first + rows] = np.sign(block.factor[rows])[:, None] * w
             first += block.h.size
         column, value = (np.concatenate(arrays) for arrays in zip(*terms, strict=True))
-        priced = self.program if touched is None else self.program.tangent(touched)
         slope = mu @ self.program.A + (0.0 if self.elastic else priced.q)
         slope = slope + np.bincount(column, value, self.program.n)
-        self._balance_slopes(slope, deviations, late)
+        is_balanced = self._balance_slopes(slope, deviations, late)
+        self._refine_deviations(slope, ~is_balanced & (priced.weights == 0.0), y, deviations)
         if not self.spread.is_box:
             deviations = deviations + DRAWN * (self.spread.inner - deviations)
         return y, deviations
@@ -384,9 +389,10 @@ class Counterpart:
 
     def _balance_slopes(
         self, slope: Array, deviations: Array, late: list[tuple[UncertainRows, int, _Part, np.ndarray, float]]
-    ) -> None:
+    ) -> np.ndarray:
         """Set the deviations of the parts whose entries are single variables, such that no slope is left in these, as
-        far as their sets allow, shared by the rows in which a variable is."""
+        far as their sets allow, shared by the rows in which a variable is. Return which variables ``(n,)`` these
+        are."""
         reach = np.zeros(self.program.n)
         for block, p, part, _, total in late:
             np.add.at(reach, block.C[p].indices, total * np.abs(block.C[p].data) * self.spread.radii[part.entries])
@@ -398,6 +404,72 @@ class Counterpart:
             w[part.entries] = np.sign(block.C[p].data) * share[block.C[p].indices] * self.spread.radii[part.entries]
             at = rows - rows[0] + np.flatnonzero(block.part == p)[0]
             deviations[rows] = np.sign(block.factor[at])[:, None] * w
+        return reach > 0.0
+
+    def _refine_multipliers(self, slope: Array, weights: Array, y: Array) -> None:
+        """Correct multipliers, such that less is left of slopes in the variables that answer nothing, and are between
+        their bounds.
+
+        ``slope (n,)`` and ``weights (n,)`` are those of the cost and of equalities. HiGHS perturbs costs by 1e-6, and
+        its last basis may be that of perturbed costs, or too inexact for other ones.
+        """
+        active = np.flatnonzero(y > 0.0)
+        if not active.size:
+            return
+        table = csr_array(vstack([block.g for block in self.blocks]))[active]
+        answering = [C.indices for block in self.blocks for C in block.C]
+        is_inner = (self._x > self.program.lower) & (self._x < self.program.upper)
+        is_inner &= (weights == 0.0) | (self._x != 0.0)
+        is_inner[np.concatenate(answering)] = False
+        columns = np.flatnonzero(is_inner)
+        residual = slope[columns] + weights[columns] * np.sign(self._x[columns]) + (y[active] @ table)[columns]
+        if np.abs(residual).max(initial=0.0) <= ACCURACY:
+            return
+        shares = table[:, columns].T.toarray() * y[active]
+        y[active] *= np.maximum(1.0 + np.linalg.lstsq(shares, -residual, rcond=SAME)[0], 0.0)
+
+    def _refine_deviations(self, slope: Array, free: np.ndarray, y: Array, deviations: Array) -> None:
+        """Correct the deviations of rows, such that less slope is left in the variables that answer them.
+
+        The slopes of a solver are as accurate as its tolerance. For variables that are ``free (n,)``, since no row has
+        them as an entry of its own whose deviation balances them, the products of multipliers and deviations are
+        corrected by least squares, for one entry of the deviations after another. Only deviations inside of their sets
+        are changed.
+        """
+        if not self.spread.is_box or not (slope[free] != 0.0).any():
+            return
+        parts: list[tuple[csr_array, np.ndarray, Array, float]] = []  # of each part its matrix, rows, signs and weight
+        first = 0
+        for block in self.blocks:
+            for p in range(len(block.C)):
+                rows = np.flatnonzero(block.part == p)
+                rows = rows[: rows.size // 2] if block.exact else rows  # the opposites of equations have no deviations
+                total = float(y[first + rows] @ np.abs(block.factor[rows]))
+                if total > 0.0:
+                    parts.append((block.C[p], first + rows, np.sign(block.factor[rows]), total))
+            first += block.h.size
+        for entry, radius in enumerate(self.spread.radii.tolist()):
+            answering = [part for part in parts if part[0].indptr[entry] < part[0].indptr[entry + 1]]
+            if radius <= 0.0 or not answering:
+                continue
+            lines = [C[[entry]] for C, _, _, _ in answering]
+            columns = np.unique(np.concatenate([line.indices for line in lines]))
+            columns = columns[free[columns]]
+            if not columns.size or not slope[columns].any():
+                continue
+            shares = np.array([deviations[rows[0], entry] * signs[0] for _, rows, signs, _ in answering]) / radius
+            weights = radius * np.array([total for _, _, _, total in answering])
+            table = np.stack([line.toarray()[0][columns] for line in lines], axis=1) * weights
+            room = np.maximum(1.0 - np.abs(shares), 0.0)  # what is inside of its set moves first
+            change = room * np.clip(np.linalg.lstsq(table * room, -slope[columns], rcond=SAME)[0], -1.0, 1.0)
+            refined = np.clip(shares + change, -1.0, 1.0)
+            slope[columns] += table @ (refined - shares)
+            limits = np.nextafter(-1.0 - refined, -np.inf), np.nextafter(1.0 - refined, np.inf)
+            change = lsq_linear(table, -slope[columns], limits, "bvls", SAME, max_iter=PASSES).x
+            final = np.clip(refined + change, -1.0, 1.0)
+            slope[columns] += table @ (final - refined)
+            for (_, rows, signs, _), share in zip(answering, final.tolist(), strict=True):
+                deviations[rows, entry] = signs * share * radius
 
 
 @final
