@@ -12,7 +12,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.control.response.orbit import Orbit
-from sparserob_core.control.response.response import merge_grids
+from sparserob_core.control.response.time_grid import merge_grids
 from tests.support.nodes import CONFIGS, at_nodes
 
 

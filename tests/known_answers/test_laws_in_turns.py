@@ -16,7 +16,8 @@ import sparserob_core as sr
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.control.problem.system import VaryingSystem
-from sparserob_core.control.response.response import Propagator, merge_grids
+from sparserob_core.control.response.response import Propagator
+from sparserob_core.control.response.time_grid import merge_grids
 from sparserob_core.control.response.varying.expansion import Expansion
 from tests.known_answers.test_checks import pieces, verified
 from tests.known_answers.test_varying_systems import FADING

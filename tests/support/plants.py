@@ -12,7 +12,8 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.response.disturbance import disturbance_model
-from sparserob_core.control.response.response import Response, merge_grids
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.time_grid import merge_grids
 
 
 def indicators(breakpoints):

@@ -31,7 +31,8 @@ from sparserob_core.control.reach.sizes import row_sizes
 from sparserob_core.control.reach.support import Leg, Supports
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Direct, MovingReference, Reference
-from sparserob_core.control.response.response import OutputResponse, Response, distinct_times
+from sparserob_core.control.response.response import OutputResponse, Response
+from sparserob_core.control.response.time_grid import distinct_times
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Separation

@@ -12,7 +12,8 @@ from sparserob_core.control.constraints.flat import KEPT
 from sparserob_core.control.constraints.local_maxima import local_maxima, vertices
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.disturbance import DisturbanceModel
-from sparserob_core.control.response.response import SAME_TIME, Response, distinct_times
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.time_grid import SAME_TIME, distinct_times
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import ConstraintFamily, Explanation, Separation
 

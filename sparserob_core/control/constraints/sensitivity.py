@@ -16,8 +16,9 @@ import numpy as np
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.reach.functional import CHUNK
 from sparserob_core.control.response.inner_loop import Weights
-from sparserob_core.control.response.response import Response, TimeGrid
+from sparserob_core.control.response.response import Response
 from sparserob_core.control.response.sensitivity_system import tangent
+from sparserob_core.control.response.time_grid import TimeGrid
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.relaxed.index_gradient import differences
 

@@ -25,7 +25,8 @@ from sparserob_core.sip.finite import Spread
 
 if TYPE_CHECKING:
     from sparserob_core.control.response.inner_loop import InnerLoop
-    from sparserob_core.control.response.response import PieceTransitions, TimeGrid
+    from sparserob_core.control.response.response import PieceTransitions
+    from sparserob_core.control.response.time_grid import TimeGrid
 
 ROUND_OFF = 2.0**-46  # of the numbers that are added up
 FLOWS_KEPT = 8  # lists of times to which transitions of a system in t are remembered: each round asks for the same

@@ -7,7 +7,7 @@ import numpy as np
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.terms.windows import MixedConstraint
-from sparserob_core.control.response.response import SAME_TIME
+from sparserob_core.control.response.time_grid import SAME_TIME
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.terms.accumulated import in_rows
 from sparserob_core.control.transcription.transcribe import prepare

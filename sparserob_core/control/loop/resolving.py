@@ -16,7 +16,7 @@ from sparserob_core.control.loop.remaining import refuse_remaining, remaining
 from sparserob_core.control.loop.retuning import Retuning, retuned
 from sparserob_core.control.loop.tracking import Tracking, trackable
 from sparserob_core.control.problem.units import Units
-from sparserob_core.control.response.response import SAME_TIME
+from sparserob_core.control.response.time_grid import SAME_TIME
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import from_state, in_own_units
 from sparserob_core.errors import SparseRobError

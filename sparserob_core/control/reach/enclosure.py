@@ -27,7 +27,7 @@ from sparserob_core.control.enclosures.polynomial import (
 from sparserob_core.control.enclosures.valid_inequalities import Cuts
 from sparserob_core.control.reach.support import Supports
 from sparserob_core.control.response.reference import Direct, MovingReference
-from sparserob_core.control.response.response import TimeGrid
+from sparserob_core.control.response.time_grid import TimeGrid
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.expressions.rounding import rounding

@@ -16,7 +16,8 @@ from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.reach.over_cells import FunctionalsOverCells
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.inner_loop import Weights
-from sparserob_core.control.response.response import Response, TimeGrid
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.time_grid import TimeGrid
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 

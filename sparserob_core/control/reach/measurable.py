@@ -28,7 +28,8 @@ from sparserob_core.control.reach.support import (
     over_directions,
 )
 from sparserob_core.control.response.lifted import LiftedSystem
-from sparserob_core.control.response.response import Response, TimeGrid, unique_rows
+from sparserob_core.control.response.response import Response, unique_rows
+from sparserob_core.control.response.time_grid import TimeGrid
 from sparserob_core.control.sets.integrals import HALVINGS, integrated
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped

@@ -30,7 +30,8 @@ from sparserob_core.control.enclosures.comparison import product
 from sparserob_core.control.enclosures.dependence import ExpandedSystem
 from sparserob_core.control.reach.disturbance_support import over_faces, summed
 from sparserob_core.control.response.disturbance import DisturbanceModel
-from sparserob_core.control.response.response import Propagator, TimeGrid
+from sparserob_core.control.response.response import Propagator
+from sparserob_core.control.response.time_grid import TimeGrid
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet

@@ -16,7 +16,7 @@ import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.disturbances import Breakpoints, Classes, apart
-from sparserob_core.control.response.response import TimeGrid
+from sparserob_core.control.response.time_grid import TimeGrid
 from sparserob_core.control.sets.sets import NormBall, Polytope, product
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, shaped

@@ -44,7 +44,8 @@ from sparserob_core.control.enclosures.flows import Flows
 from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.orbit import Orbit
-from sparserob_core.control.response.response import TINY, Response, TimeGrid
+from sparserob_core.control.response.response import TINY, Response
+from sparserob_core.control.response.time_grid import TimeGrid
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.expressions.rounding import rounding
 from sparserob_core.sip.expressions.taylor import TaylorSpace, taylor_space

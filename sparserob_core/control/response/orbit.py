@@ -30,7 +30,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb_mat
 
-    from sparserob_core.control.response.response import TimeGrid
+    from sparserob_core.control.response.time_grid import TimeGrid
 
 # Logarithm of a growth from which states are followed so: of sixteen digits a plant then keeps fewer than twelve. With
 # half of it plants take longer that lose nothing, with twice as much a certificate is lost at the end of a horizon.

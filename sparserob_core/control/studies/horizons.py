@@ -27,7 +27,7 @@ from sparserob_core.control.reach.support import InitialSupport
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.lifted import LiftedSystem, lift
 from sparserob_core.control.response.reference import STILL, Reference
-from sparserob_core.control.response.response import TimeGrid, merge_grids
+from sparserob_core.control.response.time_grid import TimeGrid, merge_grids
 from sparserob_core.control.transcription.own_units import extent, rough_units
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet

@@ -13,7 +13,8 @@ from sparserob_core.control.enclosures.decoupling import decoupled, pace
 from sparserob_core.control.enclosures.flows import Flows
 from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.response.response import Response, TimeGrid, distinct_times
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.time_grid import TimeGrid, distinct_times
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:

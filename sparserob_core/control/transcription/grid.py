@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.response.response import TimeGrid, merge_grids
+from sparserob_core.control.response.time_grid import TimeGrid, merge_grids
 from sparserob_core.sip.convex_set import Array
 
 

@@ -18,7 +18,8 @@ from scipy.sparse import csc_array, diags_array, eye_array, kron
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.response.response import Propagator, TimeGrid
+from sparserob_core.control.response.response import Propagator
+from sparserob_core.control.response.time_grid import TimeGrid
 from sparserob_core.control.transcription.grid import grid_of
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array

@@ -21,7 +21,8 @@ from sparserob_core.control.response.disturbance import DisturbanceModel, distur
 from sparserob_core.control.response.inner_loop import NO_INNER_LOOP, InnerLoop
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Reference
-from sparserob_core.control.response.response import SAME_TIME, Response, distinct_times
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.time_grid import SAME_TIME, distinct_times
 from sparserob_core.control.transcription.grid import grid_of
 from sparserob_core.control.transcription.own_units import (
     own_units,

@@ -7,7 +7,7 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.constraints.state import StateConstraint
-from sparserob_core.control.response.response import SAME_TIME
+from sparserob_core.control.response.time_grid import SAME_TIME
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import TOLERANCE
 

@@ -30,7 +30,7 @@ from sparserob_core.checker.sets.shape import excess, find_inner_support_point
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.terms.windows import PathConstraint
-from sparserob_core.control.response.response import merge_grids
+from sparserob_core.control.response.time_grid import merge_grids
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.sip.expressions.expression import parse_matrix

@@ -15,7 +15,8 @@ from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, 
 from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.many_directions import ManyDirections
 from sparserob_core.control.response.disturbance import disturbance_model
-from sparserob_core.control.response.response import OutputResponse, Response, TimeGrid, merge_grids
+from sparserob_core.control.response.response import OutputResponse, Response
+from sparserob_core.control.response.time_grid import TimeGrid, merge_grids
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall, Product
 from sparserob_core.errors import InputError
 from tests.support.plants import indicators, random_system, simulated, uniform, walsh

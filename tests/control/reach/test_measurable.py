@@ -16,7 +16,8 @@ from scipy.optimize import brentq
 
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System
 from sparserob_core.control.reach import measurable
-from sparserob_core.control.response.response import Response, merge_grids
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.time_grid import merge_grids
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Box
 from tests.support.plants import indicators, random_system, uniform, worst_case

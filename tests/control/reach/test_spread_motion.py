@@ -16,7 +16,8 @@ from sparserob_core.control.enclosures import dependence
 from sparserob_core.control.enclosures.dependence import ExpandedSystem
 from sparserob_core.control.reach.varying_motion import SpreadMotion, Truncation, VaryingMotion
 from sparserob_core.control.response.disturbance import DisturbanceModel
-from sparserob_core.control.response.response import OutputResponse, Propagator, Response, merge_grids
+from sparserob_core.control.response.response import OutputResponse, Propagator, Response
+from sparserob_core.control.response.time_grid import merge_grids
 from sparserob_core.control.response.varying import spread as expansions
 from sparserob_core.control.response.varying.discs import cauchy
 from sparserob_core.control.response.varying.expansion import Expansion

@@ -23,7 +23,8 @@ from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.control.response.disturbance import disturbance_model
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Reference
-from sparserob_core.control.response.response import Response, merge_grids
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.time_grid import merge_grids
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
 from sparserob_core.control.sets.sets import Ellipsoid
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet

@@ -15,7 +15,7 @@ from sparserob_core.control.enclosures.polynomial import face_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.reach.disturbance_support import summed
 from sparserob_core.control.response.disturbance import disturbance_model
-from sparserob_core.control.response.response import merge_grids
+from sparserob_core.control.response.time_grid import merge_grids
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Box

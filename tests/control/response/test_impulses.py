@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.response.response import OutputResponse, Propagator, Response, merge_grids
+from sparserob_core.control.response.response import OutputResponse, Propagator, Response
+from sparserob_core.control.response.time_grid import merge_grids
 from sparserob_core.sip.convex_set import Box
 from tests.support.plants import random_system, uniform, worst_case
 

@@ -11,7 +11,8 @@ from scipy.linalg import expm
 
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.inner_loop import NO_INNER_LOOP, InnerLoop
-from sparserob_core.control.response.response import Response, merge_grids
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.time_grid import merge_grids
 
 PLANTS = {
     "pendulum": (np.array([[0.0, 1.0], [9.0, 0.0]]), np.array([[0.0], [1.0]])),

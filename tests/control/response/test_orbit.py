@@ -13,7 +13,8 @@ from scipy.linalg import expm
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System
 from sparserob_core.control.response.lifted import lift_legs
 from sparserob_core.control.response.orbit import NOTABLE, Measure, Orbit, growth
-from sparserob_core.control.response.response import Response, TimeGrid, merge_grids
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.time_grid import TimeGrid, merge_grids
 from sparserob_core.sip.convex_set import Box
 
 RATE, DIGITS = 5, 80

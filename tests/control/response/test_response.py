@@ -20,7 +20,8 @@ from sparserob_core.control.reach import functional, many_directions
 from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
 from sparserob_core.control.reach.many_directions import ManyDirections
 from sparserob_core.control.response.lifted import lift
-from sparserob_core.control.response.response import Propagator, Response, merge_grids, unique_rows
+from sparserob_core.control.response.response import Propagator, Response, unique_rows
+from sparserob_core.control.response.time_grid import merge_grids
 from sparserob_core.sip.convex_set import Box
 from tests.support.plants import indicators, random_system, simulated, uniform, walsh, worst_case
 

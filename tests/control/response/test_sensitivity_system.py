@@ -7,8 +7,9 @@ import pytest
 from scipy.linalg import expm
 
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
-from sparserob_core.control.response.response import Response, merge_grids
+from sparserob_core.control.response.response import Response
 from sparserob_core.control.response.sensitivity_system import Derivatives, tangent
+from sparserob_core.control.response.time_grid import merge_grids
 from sparserob_core.sip.convex_set import Box
 from tests.support.plants import random_system, uniform
 

@@ -446,7 +446,8 @@ def test_a_directory_that_takes_no_result_is_refused_before_anything_is_computed
 def test_an_orbit_in_metres_and_seconds_is_walked_to_rounding() -> None:
     from flint import arb, arb_mat, ctx
 
-    from sparserob_core.control.response.response import Response, TimeGrid
+    from sparserob_core.control.response.response import Response
+    from sparserob_core.control.response.time_grid import TimeGrid
 
     n, horizon, begin = 1.13e-3, 6000.0, [-3e4, 500.0, 8.5, 0.0]
     A = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [0, 0, 0, 2 * n], [0, 3 * n * n, -2 * n, 0]])

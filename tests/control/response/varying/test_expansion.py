@@ -12,7 +12,8 @@ from scipy.integrate import solve_ivp
 
 import sparserob_core.control.response.varying.expansion as varying
 from sparserob_core.control.problem.system import VaryingSystem
-from sparserob_core.control.response.response import Response, merge_grids
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.time_grid import merge_grids
 from sparserob_core.control.response.varying.expansion import Expansion, Flow, balanced, steadied
 from sparserob_core.control.response.varying.spread import law_of
 from sparserob_core.control.sets.sets import Box
