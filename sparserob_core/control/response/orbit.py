@@ -16,7 +16,7 @@ from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
 from math import ceil, log
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -38,6 +38,9 @@ NOTABLE = 10.0
 # Bits of a number beside those that the growth takes twice: once for the states, once for what lands on the last digits
 # of a double. With half of them errors are no longer those of rounding to doubles; twice as many take as long.
 BITS = 128
+SHIFTS, DEEPEST = (0, 2, 4, 8, 12, 16, 24, 32), 300  # powers of two between modes, and in all, that are tried
+SHORT = 1e-12  # of the values and of what the state does: what is missing, from which more entries move
+GROUPS = 64  # in which entries are rounded: ten times as many take as many times as long, and land no better
 NEARLY = 1e-6  # of the largest entry of a control: a change that is for more than rounding
 FASTEST = 300.0  # logarithm of the growth of errors up to which states are followed so: bounds are doubles
 TINY = float(np.finfo(float).tiny)  # what a conversion to a double may lose of the smallest numbers
@@ -76,6 +79,13 @@ def _bound_entries(matrix: arb_mat) -> Array:
     return np.array([float(abs(entry).upper()) for entry in matrix.entries()]) * OUTWARD + TINY
 
 
+def _bound_rate(matrix: list[list[Any]]) -> Any:
+    """Return an upper bound of the largest eigenvalue of the symmetric part of a matrix, in any kind of numbers
+    (Gershgorin 1931)."""
+    count = range(len(matrix))
+    return max(sum((abs(matrix[i][j] + matrix[j][i]) / 2 for j in count if j != i), matrix[i][i]) for i in count)
+
+
 @dataclass(frozen=True, eq=False)
 class Measure:
     """Norm ``|T^-1 x|`` of states in which a plant grows by at most ``e^{rate t}``: ``transform (d, d)`` is ``T``, and
@@ -91,15 +101,14 @@ class Measure:
         from flint import arb_mat
 
         T = decoupled(A).transform
+        candidates = [T * 2.0 ** (-shift * np.arange(len(A))) for shift in SHIFTS if shift * len(A) < DEEPEST]
+        inverses = (np.linalg.inv(candidate) for candidate in candidates)
+        rates = [_bound_rate((V @ A @ S).tolist()) for V, S in zip(inverses, candidates, strict=True)]
+        T = candidates[int(np.argmin(rates))]
         with precision(BITS):
             exact = arb_mat(T.tolist())
             inverse = exact.inv()
-            moved = inverse * arb_mat(A.tolist()) * exact
-            symmetric = ((moved + moved.transpose()) / 2).tolist()
-            ends = [
-                sum((abs(entry) for j, entry in enumerate(row) if j != i), row[i]) for i, row in enumerate(symmetric)
-            ]
-            rate = max(float(end.upper()) for end in ends)  # Gershgorin 1931
+            rate = float(_bound_rate((inverse * arb_mat(A.tolist()) * exact).tolist()).upper())
             size = _bound_entries(inverse).reshape(T.shape)
         return Measure(T, size, max(rate, 0.0) * OUTWARD)
 
@@ -107,7 +116,7 @@ class Measure:
         """Return the norm of an error after a piece of some length, at whose end states are ``missed (d,)`` too."""
         exponent = self.rate * length
         carried_error = float(np.exp(exponent)) * (1.0 + (exponent + 1.0) * (OUTWARD - 1.0)) * error
-        return OUTWARD * (carried_error + float(np.linalg.norm(self.size @ missed)) * OUTWARD)
+        return OUTWARD * (carried_error + float((self.size @ missed).sum()) * OUTWARD)
 
     def enter(self, before: Measure, error: float) -> float:
         """Return the norm of an error of which the norm of the phase before is ``error``."""
@@ -200,24 +209,23 @@ class Orbit:
     ) -> Float[Array, "m K"]:
         """Return a control whose final state ``x`` has ``H x = values`` as nearly as doubles allow.
 
-        Only entries that are neither 0 nor at one of their ``limits`` move, by what rounding may have done to them. The
-        early ones are rounded first, and the later ones make up for that: their last digits move the final state by
-        less. The control itself is returned where more than rounding is missing.
+        Only entries that are neither 0 nor at one of their ``limits`` move, by what rounding may have done to them; a
+        few of the last ones that are 0 do where the others do not suffice. The early ones are rounded first, and the
+        later ones make up for that: their last digits move the final state by less. The control itself is returned
+        where more than rounding is missing.
         """
         entries, (lower, upper) = control.T.ravel(), (np.tile(limit, control.shape[1]) for limit in limits)  # by pieces
-        landed, most = entries.copy(), NEARLY * np.abs(entries).max(initial=0.0)
-        moving = np.flatnonzero((entries != 0.0) & (entries > lower + most) & (entries < upper - most))
+        most = NEARLY * np.abs(entries).max(initial=0.0)
+        is_inside = (entries > lower + most) & (entries < upper - most)
+        moving, idle = (np.flatnonzero(is_inside & mask) for mask in (entries != 0.0, entries == 0.0))
         with precision(self.bits):
             effects, missing = self._find_effects(control, H, values)
-            effects = [effects[number] for number in moving.tolist()]
-            squares = _sum_squares(effects, len(values))
-            for number, place in enumerate(moving.tolist()):
-                change = _find_first_change(effects[number:], squares[number], missing)
-                if not abs(change) <= most:
-                    return control
-                landed[place] = entries[place] + change
-                missing = (missing - effects[number] * column(landed[place : place + 1] - entries[place])).mid()
-        return np.ascontiguousarray(landed.reshape(control.T.shape).T)
+            landed, left = _round_towards(entries, moving, effects, missing, most)
+            if left > SHORT * float(np.abs(values).max() + np.abs(self.states(control)[0] @ H.T).max()):
+                more = np.sort(np.append(moving, idle[-len(values) :]))
+                again, left_then = _round_towards(entries, more, effects, missing, most)
+                landed = again if left_then < left else landed
+        return control if landed is entries else np.ascontiguousarray(landed.reshape(control.T.shape).T)
 
     def _find_effects(self, control: Array, H: Array, values: Array) -> tuple[list[arb_mat], arb_mat]:
         """Return the effect ``(e, 1)`` of every entry of a control on ``H x`` at the end, piece after piece, and what
@@ -259,25 +267,54 @@ class Orbit:
         return self._steps
 
 
-def _sum_squares(effects: list[arb_mat], count: int) -> list[arb_mat]:
-    """Return the sums ``(e, e)`` of ``c c'`` over every effect ``c (e, 1)`` and those after it; ``count`` is ``e``."""
+def _round_towards(
+    entries: Array, moving: np.ndarray, effects: list[arb_mat], missing: arb_mat, most: float
+) -> tuple[Array, float]:
+    """Return entries in doubles with which nothing is ``missing (e, 1)``, and the largest size of what still is; the
+    ``entries`` themselves where one of the ``moving`` would move by more than ``most``.
+
+    All that are left move by least together; one group of them after the other is rounded.
+    """
+    if not moving.size:
+        return entries, np.inf
+    landed, groups = entries.copy(), np.array_split(moving, min(GROUPS, moving.size))
+    squares = _sum_squares([[effects[place] for place in group.tolist()] for group in groups], missing.nrows())
+    for number, group in enumerate(groups):
+        rest = [effects[place] for place in np.concatenate(groups[number:]).tolist()]
+        changes = _find_changes(rest, squares[number], missing)[: group.size]
+        if not (np.abs(changes) <= most).all():
+            return entries, np.inf
+        landed[group] = entries[group] + changes
+        for place in group.tolist():
+            missing = (missing - effects[place] * column(landed[place : place + 1] - entries[place])).mid()
+    return landed, float(_bound_entries(missing).max(initial=0.0))
+
+
+def _sum_squares(groups: list[list[arb_mat]], count: int) -> list[arb_mat]:
+    """Return the sums ``(e, e)`` of ``c c'`` over the effects ``c (e, 1)`` of every group and those after it; ``count``
+    is ``e``."""
     from flint import arb_mat
 
     sums = [arb_mat(count, count)]
-    for effect in reversed(effects):
-        sums.append((sums[-1] + effect * effect.transpose()).mid())
+    for effects in reversed(groups):
+        total = sums[-1]
+        for effect in effects:
+            total = (total + effect * effect.transpose()).mid()
+        sums.append(total)
     return sums[:0:-1]
 
 
-def _find_first_change(effects: list[arb_mat], squares: arb_mat, missing: arb_mat) -> float:
-    """Return the change of the first of several entries that together, and changed by least, make up for what is
-    ``missing (e, 1)``; or that leave least of it, where they are few."""
+def _find_changes(effects: list[arb_mat], squares: arb_mat, missing: arb_mat) -> Array:
+    """Return the changes of entries that together make up for what is ``missing (e, 1)`` and are least; or that leave
+    least of it, where the entries are few. They are 0 where some of the values do not depend on the entries."""
     from flint import arb_mat
 
     try:
         if len(effects) >= squares.nrows():
-            return float((effects[0].transpose() * squares.solve(missing))[0, 0].mid())
+            prices = squares.solve(missing).mid()
+            return np.array([float((effect.transpose() * prices)[0, 0].mid()) for effect in effects])
         C = arb_mat([list(row) for row in zip(*(effect.entries() for effect in effects), strict=True)])
-        return float(((C.transpose() * C).mid().solve(C.transpose() * missing))[0, 0].mid())
-    except ZeroDivisionError:  # some of the values do not depend on these entries
-        return 0.0
+        least = (C.transpose() * C).mid().solve(C.transpose() * missing)
+        return np.array([float(entry.mid()) for entry in least.entries()])
+    except (ZeroDivisionError, IndexError):
+        return np.zeros(len(effects))

@@ -97,7 +97,7 @@ def promised(model: Transcription) -> list[str]:
     name, units = problem.names.state(state), problem.names.state_units
     distance = f"{moved[state]:.1g} {units[state]}" if state < len(units) else f"{moved[state]:.1g}"
     digits = f"in open loop an error in the last digit of the control ends up to {distance} off in {name}"
-    return [f"{digits}; feedback does not let it grow"]
+    return [f"{digits}; feedback with prestabilise does not let it grow"]
 
 
 def hindrance(system: System, horizon: float) -> str:

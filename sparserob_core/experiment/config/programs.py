@@ -71,7 +71,7 @@ def _state_index_set(index: Parameters, key: str) -> Mapping[str, Any]:
 
 @final
 class ProgramProblem(ProblemFactory, Options):
-    """The least value of a convex objective under rows that hold for every index of a box, all of it stated as text."""
+    """The least value of a convex objective under rows that hold for every index of a set, all of it stated as text."""
 
     decision: Annotated[dict[str, DecisionOptions], Field(min_length=1)]
     """Entries that are chosen, by name, in order."""

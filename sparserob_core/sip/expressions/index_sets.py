@@ -13,7 +13,7 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Array
 from sparserob_core.sip.expressions.expression import Value
-from sparserob_core.sip.expressions.triangulation import MAX_MEETINGS, Simplex, find_vertices, triangulate
+from sparserob_core.sip.expressions.triangulation import MAX_MEETINGS, Simplex, exact, find_vertices, triangulate
 
 Index: TypeAlias = "Mapping[str, Any] | Sequence[Mapping[str, Any]]"
 """Intervals by name; or ``names`` and a ``polytope``; or a list of these."""
@@ -151,7 +151,10 @@ class Region:
         _require_bounded(self.H, self.h)
         vertices = find_vertices(self.H, self.h)
         if vertices is None:
-            raise _polytope_error(f"fewer rows: at most {MAX_MEETINGS} meetings", f"{len(self.H)} rows")
+            raise _polytope_error(
+                f"fewer rows, of which at most {MAX_MEETINGS} choices meet in a point",
+                f"{len(self.H)} rows in {self.H.shape[1]} coordinates",
+            )
         if not vertices:
             raise _polytope_error("a polytope with a point in it", "an empty one")
         if len(vertices) == 1:
@@ -172,15 +175,32 @@ def _polytope_error(expected: str, got: str) -> InputError:
 
 
 def _require_bounded(H: Array, h: Array) -> None:
-    """Raise `InputError` where a polytope is empty or unbounded."""
+    """Raise `InputError` where a polytope is empty, or not shown to be bounded.
+
+    Multipliers ``y >= 0`` with ``y'H = axis + r`` bound a coordinate, ``t_j <= y'h - r't``. Where the sizes of all
+    ``r`` add up to less than 1 they bound every coordinate. This is seen in fractions, whatever a solver says.
+    """
     from scipy.optimize import linprog
 
+    largest = np.abs(H).max(axis=0, initial=0.0)
+    units = np.exp2(
+        -np.round(np.log2(np.where(largest > 0.0, largest, 1.0)))
+    )  # coordinates in which no entry is lost beside others
+    scaled, missed = H * units, Fraction(0)
+    scaled_rows = exact(scaled)
     for axis in np.vstack([np.eye(H.shape[1]), -np.eye(H.shape[1])]):
-        status = linprog(-axis, A_ub=H, b_ub=h, bounds=(None, None)).status
-        if status == 2:
+        found = linprog(-axis, A_ub=scaled, b_ub=h, bounds=(None, None))
+        if found.status == 2:
             raise _polytope_error("a polytope with a point in it", "an empty one")
-        if status != 0:
+        if found.status != 0:
             raise _polytope_error("a bounded polytope", "an unbounded one")
+        y = [Fraction(max(0.0, -float(marginal))) for marginal in found.ineqlin.marginals]
+        columns = zip(*scaled_rows, strict=True)
+        sums = [sum((a * b for a, b in zip(y, rows, strict=True)), Fraction(0)) for rows in columns]
+        off_axis = [abs(total - Fraction(wanted)) for total, wanted in zip(sums, axis.tolist(), strict=True)]
+        missed = max(missed, sum(off_axis, Fraction(0)))
+    if missed >= 1:
+        raise _polytope_error("a bounded polytope", "one that is not shown to be bounded")
 
 
 def read_index(index: Index) -> list[Region]:

@@ -17,7 +17,9 @@ Simplex: TypeAlias = "tuple[Point, ...]"
 
 MAX_MEETINGS = 20_000  # meetings of rows that are tried as vertices: a second or two
 REGULAR = 1e-12  # determinant of unit rows from which on their meeting is known to a thousandth
-VIOLATED = 1e-9  # relative violation of a row by a meeting, above which fractions are not needed to exclude it
+# Relative violation of a row by a meeting, above which fractions are not needed to exclude it; and what rounding moves
+# a meeting by, times its determinant, with room for six coordinates.
+VIOLATED, MOVED = 1e-9, 1e-12
 
 
 def exact(numbers: Array) -> list[list[Fraction]]:
@@ -42,9 +44,11 @@ def find_vertices(H: Array, h: Array) -> list[Point] | None:
         return None
     choices = np.array(list(combinations(range(count), d)), dtype=int).reshape(-1, d)
     normals, ends = (H / norms[:, None])[choices], (h / norms)[choices]
-    is_regular = np.abs(np.linalg.det(normals)) > REGULAR
+    sizes = np.abs(np.linalg.det(normals))
+    is_regular = sizes > REGULAR
     points = np.linalg.solve(normals[is_regular], ends[is_regular][..., None])[..., 0]
-    is_outside = points @ H.T - h > VIOLATED * (np.abs(points) @ np.abs(H).T + np.abs(h))
+    doubt = VIOLATED + MOVED / sizes[is_regular]
+    is_outside = points @ H.T - h > doubt[:, None] * (np.abs(points) @ np.abs(H).T + np.abs(h))
     candidates = np.concatenate([choices[is_regular][~is_outside.any(axis=1)], choices[~is_regular]])
     rows, sides = exact(H), [Fraction(float(side)) for side in h]
     meetings = {_intersect_hyperplanes([rows[i] for i in choice], [sides[i] for i in choice]) for choice in candidates}

@@ -106,7 +106,7 @@ def _divide_rows(program: FiniteProgram) -> NewVariables | None:
 
     Returns ``None`` where rows are ordinary, and where too many directions are large.
     """
-    if program.blocks is not None or not (program.h.size or program.b.size):
+    if program.blocks is not None or not (program.h.size or program.b.size) or program.b.size > program.n:
         return None
     reach = _reach(program)
     L, Q = _orthogonalise(program.A)
@@ -246,7 +246,7 @@ def _find_axes(P: csc_array) -> tuple[Array, Array] | None:
     if P.shape[0] > LARGEST:
         return None
     eigenvalues, axes = np.linalg.eigh(P.toarray())
-    ratio = eigenvalues[0] / eigenvalues[-1]
+    ratio = eigenvalues[0] / eigenvalues[-1] if eigenvalues[-1] > 0.0 else 0.0
     return (axes / np.sqrt(eigenvalues), eigenvalues) if DEPENDENT <= ratio <= 1.0 / UNEVEN else None
 
 

@@ -228,7 +228,7 @@ class RelaxedProgram:
         self, rows: Rows, epsilon: float, margin: float = 0.0, guess: FiniteSolution | None = None
     ) -> FiniteSolution:
         """Solve with all of these rows at once, each tightened by ``margin`` times its norm; ``guess`` is a solution
-        with the same rows. The decision is settled, where the program has a way to do that."""
+        with the same rows. The decision is rounded so that equalities hold, where the program has a way to do that."""
         h = rows.h - margin * rows.norms if margin else rows.h
         solution, settle = self._solve_rows(rows.G, h, epsilon, guess), self.program.settle
         if settle is None or solution.status == "infeasible":

@@ -89,6 +89,11 @@ def test_a_control_lands_to_its_last_digits_and_what_is_0_stays_0(idle: tuple[in
     assert not landed[0, list(idle)].any() and np.count_nonzero(landed) == 40 - len(idle)
 
 
+def test_a_control_without_an_entry_that_may_move_is_returned() -> None:
+    orbit, nothing = orbit_of(5.0), np.zeros((1, 40))
+    assert orbit.landed(nothing, np.eye(2), np.zeros(2), WIDE) is nothing
+
+
 def test_a_control_that_misses_by_more_than_rounding_is_returned() -> None:
     orbit, control = orbit_of(5.0), np.ones((1, 40))
     assert orbit.landed(control, np.eye(2), np.zeros(2), WIDE) is control
@@ -194,6 +199,27 @@ def test_errors_grow_by_no_more_than_their_norm_says(seed: int) -> None:
         assert measure.pass_by(before, t, np.abs(x)) >= bound + float(np.linalg.norm(inverse @ x))
     fastest = max(0.0, float(np.linalg.eigvals(A).real.max()))
     assert fastest * (1.0 - 1e-9) <= measure.rate <= fastest + 1e-6 * scale
+
+
+@pytest.mark.parametrize("coupling", [1.0, 100.0, 1e4])
+def test_modes_that_drive_each_other_one_way_grow_no_faster(coupling: float) -> None:
+    assert Measure.of(np.array([[3.0, coupling], [0.0, 3.0]])).rate <= 3.2
+    assert Measure.of(np.array([[3.0, coupling, 0.0], [0.0, 3.0, coupling], [0.0, 0.0, 3.0]])).rate <= 3.5
+
+
+def test_what_is_missed_counts_however_small_it_is() -> None:
+    assert Measure.of(SADDLE).pass_by(0.0, 1.0, np.full(2, 1e-170)) > 0.0
+
+
+def test_an_entry_that_is_0_moves_where_the_others_do_not_land() -> None:
+    """One entry stops what grows, and what decays is left: a few late ones, of the size of rounding, make up for it."""
+    orbit = orbit_of(4.0)
+    near = _rest(orbit, tuple(range(1, 40)))
+    before = max(abs(float(entry)) for entry in exact(orbit, near)[-1])
+    landed = orbit.landed(near, np.eye(2), np.zeros(2), WIDE)
+    after = max(abs(float(entry)) for entry in exact(orbit, landed)[-1])
+    assert after < 1e-15 < 1e-10 < before < 1e-7
+    assert np.flatnonzero(landed).tolist() == [0, 38, 39] and np.abs(landed[0, 1:]).max() < 1e-6
 
 
 def test_a_rotated_stiff_plant_has_errors_that_do_not_grow_with_its_steps() -> None:

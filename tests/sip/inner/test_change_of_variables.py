@@ -92,6 +92,14 @@ def test_what_is_impossible_is_proven_impossible_in_the_variables_of_the_program
     assert found.status == "infeasible" and found.infeasibility > 0.0
 
 
+def test_more_equalities_than_entries_are_no_directions() -> None:
+    A, b = np.array([[1.0, 0.0], [0.0, 1e-5], [2.0, 1.0]]), np.array([0.5, 2e-5, 3.0])
+    five = np.full(2, 5.0)
+    program = FiniteProgram(np.array([1.0, 0.0]), np.zeros(2), -five, five, np.zeros((0, 2)), np.zeros(0), A, b)
+    assert in_new_variables(program) is None
+    assert solve_finite(program, SOLVER).value == pytest.approx(0.5)
+
+
 def test_ordinary_rows_are_left_as_they_are() -> None:
     assert in_new_variables(growing(0.5)) is None
 
