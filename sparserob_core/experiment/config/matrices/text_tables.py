@@ -55,5 +55,5 @@ def _read_number(name: str, number: int, entry: str) -> float:
     try:
         return float(entry.replace("_", "?"))  # Python reads 1_000 as a number, tables do not mean it so
     except ValueError:
-        hint = f" (a heading begins with {COMMENT})" if number == 1 else ""
+        hint = f" (a heading begins with {COMMENT})" if number == 1 and entry[:1].isalpha() else ""
         raise InputError(path=name, expected=f"numbers in line {number}{hint}", got=shown(entry)) from None
