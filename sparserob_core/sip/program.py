@@ -395,7 +395,7 @@ class ConstraintFamily:
             enclosure=enclose,
             excess=expressions.violations,
             sharpness=EXPRESSED,
-            explain=lambda index, row: Unexplained(f"row {row} of {name} at {piece.describe(index)}"),
+            explain=lambda index, row: Unexplained(f"{name}, {expressions.rows[row].text} at {piece.describe(index)}"),
             coordinates=piece.labels,
             believed="",
             source=expressions,

@@ -139,3 +139,20 @@ def test_a_study_of_programs_runs_over_tables_and_bounds(command: Command, tmp_p
     assert done.returncode == 0 and "certified" in done.stdout and "infeasible" in done.stdout
     done = command("sweep", config, "problem.tables.c=[1,2],[2,2]", "--out", "tables")
     assert done.returncode == 0 and done.stdout.count("certified") >= 2
+
+
+def test_an_impossible_program_is_told_in_the_words_of_its_rows(command: Command, tmp_path: Path) -> None:
+    (tmp_path / "impossible.yaml").write_text(
+        """
+problem:
+  name: program
+  decision: {a: {size: 2, lower: -1, upper: 1}}
+  minimise: a[0]
+  families:
+    - {name: above, index: {t: [0, 1]}, rows: ["a[0] + a[1]*t >= 1 + t^2"]}
+    - {name: below, index: {t: [0, 1]}, rows: ["a[0] + a[1]*t <= 1.2"]}
+"""
+    )
+    done = command("run", "impossible.yaml", "--out", "out")
+    assert "infeasible" in done.stdout and done.returncode == 3
+    assert "above, a[0] + a[1]*t >= 1 + t^2 at t = 1" in " ".join(done.stdout.split())

@@ -116,7 +116,7 @@ def test_an_index_is_told_in_the_coordinates_of_the_user() -> None:
     assert piece.locate(np.array([1.0, 1.0, 3.0])) == {"q": 3.0, "x": 2.0, "y": 0.0}
     assert piece.describe(np.array([0.5, 0.0, 3.0])) == "q = 3, x = 0, y = 0.5"
     family = sr.ConstraintFamily.from_expressions("f", index=index, rows="x + y <= d + q", decision={"d": None})
-    assert family.explanation(np.array([1.0, 1.0, 3.0]), 0).text == "row 0 of f at q = 3, x = 2, y = 0"
+    assert family.explanation(np.array([1.0, 1.0, 3.0]), 0).text == "f, x + y <= d + q at q = 3, x = 2, y = 0"
 
 
 def test_a_set_with_faces_is_a_polytope_and_a_list_is_a_union() -> None:
