@@ -151,3 +151,12 @@ def test_values_of_plants_that_grow_are_those_of_states_at_nodes(config: str, tm
     assert outcome.status == "certified"
     assert reference * (1.0 - 1e-7) <= cost <= reference * (1.0 + 1e-6), (reference, cost)
     assert set(verdicts(outcome).values()) == {"holds"}
+
+
+def test_what_an_open_loop_cannot_promise_an_inner_loop_keeps(tmp_path: Path) -> None:
+    """At e^24 rows in doubles are off by the size of the set at the end. The value is that of states at nodes."""
+    problem = amplified(8.0, "affine", terminal=[{"box": {"lower": [-0.41, -0.01], "upper": [-0.39, 0.01]}}])
+    problem.options["policy"]["prestabilise"] = "auto"
+    outcome = sr.run(problem.options, out=tmp_path / "run", quiet=True, figures=False)
+    assert outcome.status == "certified" and set(verdicts(outcome).values()) == {"holds"}
+    assert outcome.summary["cost"] == pytest.approx(4.445502007906614, rel=1e-7)
