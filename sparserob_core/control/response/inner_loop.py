@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol, final
 
 import numpy as np
 
+from sparserob_core.control.response.time_grid import TimeGrid
 from sparserob_core.sip.convex_set import Array
 
 
@@ -31,8 +32,8 @@ class Stepped(Protocol):
     """Transitions of a system on a grid: a `Propagator`."""
 
     @property
-    def grid(self) -> Any:
-        """Grid of the pieces, a `TimeGrid`."""
+    def grid(self) -> TimeGrid:
+        """Grid of the pieces."""
 
     @property
     def which(self) -> np.ndarray:
@@ -142,13 +143,13 @@ class InnerLoop:
         return np.asarray(steps.inputs[0, grid.modes[piece]][:, : self.gains.shape[1]])
 
     @staticmethod
-    def _begins(grid: Any) -> np.ndarray:
+    def _begins(grid: TimeGrid) -> np.ndarray:
         """Return the truth values ``(L,)`` of whether a piece of the control begins with a piece of the grid."""
         is_first: np.ndarray = np.diff(grid.control_piece, prepend=-1) > 0
         return is_first
 
     @classmethod
-    def _firsts(cls, grid: Any) -> np.ndarray:
+    def _firsts(cls, grid: TimeGrid) -> np.ndarray:
         """Return the piece of the grid with which each piece of the control begins, ``(K,)``."""
         return np.flatnonzero(cls._begins(grid))
 
