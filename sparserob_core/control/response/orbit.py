@@ -140,6 +140,7 @@ class Orbit:
     bits: int
     initial_state: Array
     _steps: dict[tuple[int, Fraction], tuple[arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
+    _weights: dict[bytes, tuple[arb_mat, list[arb_mat]]] = field(default_factory=dict, repr=False)
     _states: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     @staticmethod
@@ -232,18 +233,31 @@ class Orbit:
         ``H x`` misses of ``values (e,)``."""
         from flint import arb_mat
 
-        steps, inputs = self._compute_steps(), self.grid.inputs(control)
-        rows, missing = arb_mat(H.tolist()), column(values)
+        rows, weights = self._weigh(H)
+        missing = column(values) - rows * column(self.initial_state)
         effects = [arb_mat(len(values), 1) for _ in range(control.size)]
-        pieces = zip(self._pieces, inputs.T, self.grid.control_piece.tolist(), strict=True)
-        for step, entries, piece in reversed(list(pieces)):
-            flow, response = steps[step]
-            weights = rows * response
-            missing, rows = missing - weights * column(entries), rows * flow
+        pieces = zip(weights, self.grid.inputs(control).T, self.grid.control_piece.tolist(), strict=True)
+        for weight, entries, piece in pieces:
+            missing = missing - weight * column(entries)
             for channel in range(len(control) if piece >= 0 else 0):
-                effect = arb_mat([[row[channel]] for row in weights.tolist()])
-                effects[piece * len(control) + channel] = effects[piece * len(control) + channel] + effect
-        return [effect.mid() for effect in effects], (missing - rows * column(self.initial_state)).mid()
+                place = piece * len(control) + channel
+                effects[place] = effects[place] + _take_column(weight, channel)
+        return [effect.mid() for effect in effects], missing.mid()
+
+    def _weigh(self, H: Array) -> tuple[arb_mat, list[arb_mat]]:
+        """Return the weights of ``H x`` at the end on the initial state ``(e, d)`` and on the inputs on every piece
+        ``(e, m)``; remembered for the last rows."""
+        from flint import arb_mat
+
+        key = H.tobytes()
+        if key not in self._weights:
+            steps, rows, weights = self._compute_steps(), arb_mat(H.tolist()), []
+            for step in reversed(self._pieces):
+                flow, response = steps[step]
+                weights.append(rows * response)
+                rows = rows * flow
+            remember(self._weights, key, (rows, weights[::-1]), 1)
+        return self._weights[key]
 
     @cached_property
     def _pieces(self) -> list[tuple[int, Fraction]]:
@@ -278,10 +292,10 @@ def _round_towards(
     if not moving.size:
         return entries, np.inf
     landed, groups = entries.copy(), np.array_split(moving, min(GROUPS, moving.size))
-    squares = _sum_squares([[effects[place] for place in group.tolist()] for group in groups], missing.nrows())
+    tables = [_join_columns([effects[place] for place in group.tolist()]) for group in groups]
+    squares = _sum_squares(tables, missing.nrows())
     for number, group in enumerate(groups):
-        rest = [effects[place] for place in np.concatenate(groups[number:]).tolist()]
-        changes = _find_changes(rest, squares[number], missing)[: group.size]
+        changes = _find_changes(tables[number:], squares[number], missing)
         if not (np.abs(changes) <= most).all():
             return entries, np.inf
         landed[group] = entries[group] + changes
@@ -290,31 +304,44 @@ def _round_towards(
     return landed, float(_bound_entries(missing).max(initial=0.0))
 
 
-def _sum_squares(groups: list[list[arb_mat]], count: int) -> list[arb_mat]:
-    """Return the sums ``(e, e)`` of ``c c'`` over the effects ``c (e, 1)`` of every group and those after it; ``count``
+def _join_columns(columns: list[arb_mat]) -> arb_mat:
+    """Return the matrix ``(e, f)`` of some columns ``(e, 1)``."""
+    from flint import arb_mat
+
+    return arb_mat([list(row) for row in zip(*(column.entries() for column in columns), strict=True)])
+
+
+def _sum_squares(tables: list[arb_mat], count: int) -> list[arb_mat]:
+    """Return the sums ``(e, e)`` of ``C C'`` over the effects ``C (e, f)`` of every group and those after it; ``count``
     is ``e``."""
     from flint import arb_mat
 
     sums = [arb_mat(count, count)]
-    for effects in reversed(groups):
-        total = sums[-1]
-        for effect in effects:
-            total = (total + effect * effect.transpose()).mid()
-        sums.append(total)
+    for table in reversed(tables):
+        sums.append((sums[-1] + table * table.transpose()).mid())
     return sums[:0:-1]
 
 
-def _find_changes(effects: list[arb_mat], squares: arb_mat, missing: arb_mat) -> Array:
-    """Return the changes of entries that together make up for what is ``missing (e, 1)`` and are least; or that leave
-    least of it, where the entries are few. They are 0 where some of the values do not depend on the entries."""
+def _find_changes(tables: list[arb_mat], squares: arb_mat, missing: arb_mat) -> Array:
+    """Return the changes ``(f,)`` of a group of entries, the first of ``tables`` of effects.
+
+    Together with those of the groups after it they make up for what is ``missing (e, 1)``, and are least; or they leave
+    least of it, where the entries are few. They are 0 where some of the values do not depend on the entries.
+    """
+    first = tables[0].transpose()
+    try:
+        if sum(table.ncols() for table in tables) >= squares.nrows():
+            least = first * squares.solve(missing).mid()
+        else:
+            C = _join_columns([_take_column(table, number) for table in tables for number in range(table.ncols())])
+            least = (C.transpose() * C).mid().solve(C.transpose() * missing)
+    except ZeroDivisionError:
+        return np.zeros(first.nrows())
+    return np.array([float(entry.mid()) for entry in least.entries()[: first.nrows()]])
+
+
+def _take_column(table: arb_mat, number: int) -> arb_mat:
+    """Return one column ``(e, 1)`` of a matrix ``(e, f)``."""
     from flint import arb_mat
 
-    try:
-        if len(effects) >= squares.nrows():
-            prices = squares.solve(missing).mid()
-            return np.array([float((effect.transpose() * prices)[0, 0].mid()) for effect in effects])
-        C = arb_mat([list(row) for row in zip(*(effect.entries() for effect in effects), strict=True)])
-        least = (C.transpose() * C).mid().solve(C.transpose() * missing)
-        return np.array([float(entry.mid()) for entry in least.entries()])
-    except (ZeroDivisionError, IndexError):
-        return np.zeros(len(effects))
+    return arb_mat([[row[number]] for row in table.tolist()])

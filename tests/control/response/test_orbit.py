@@ -267,7 +267,7 @@ def test_every_piece_begins_anew_however_many_there_are() -> None:
 
 def test_errors_count_the_radii_of_balls_with_few_bits() -> None:
     orbit, control = orbit_of(5.0), np.random.default_rng(4).uniform(-5.0, 5.0, (1, 40))
-    orbit = replace(orbit, bits=60, _steps={})
+    orbit = replace(orbit, bits=60, _steps={}, _weights={})
     states, errors = orbit.states(control)
     off = np.array(
         [
@@ -283,7 +283,7 @@ def test_numbers_have_as_many_bits_as_the_growth_takes() -> None:
     landed = orbit.landed(_rest(orbit), np.eye(2), np.zeros(2), WIDE)
     _, errors = orbit.states(landed)
     assert orbit.bits > 700 and (errors <= 2.0**-52).all()
-    assert (replace(orbit, bits=192, _steps={}, _states={}).states(landed)[1] > 1.0).any()
+    assert (replace(orbit, bits=192, _steps={}, _weights={}, _states={}).states(landed)[1] > 1.0).any()
 
 
 def _rest(orbit: Orbit, idle: tuple[int, ...] = ()) -> np.ndarray:
