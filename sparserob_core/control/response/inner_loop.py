@@ -70,6 +70,11 @@ class InnerLoop:
         """True where there is such a feedback."""
         return bool(self.gains.size)
 
+    @property
+    def noun(self) -> str:
+        """What acts before anything is answered, in words."""
+        return "the inner loop" if self.acts else "the nominal control"
+
     def in_units(self, units: Any) -> InnerLoop:
         """Return the same feedback in other `Units`."""
         if not self.acts:

@@ -176,9 +176,9 @@ def _collect_feedback_data(
 ) -> dict[str, Any]:
     """Return the additional data of figures under feedback.
 
-    These are the tube of the nominal control alone, the extremes of the control under the disturbance, the gains and
-    the outputs. With ``draws`` there are also the effort under so many random disturbances and the terms of the control
-    in the worst case.
+    These are the tube of the nominal control or of the inner loop alone, the extremes of the control under the
+    disturbance, the gains and the outputs. With ``draws`` there are also the effort under so many random disturbances
+    and the terms of the control in the worst case.
     """
     loop, nominal_tube = (
         model.answering.loop,
@@ -186,6 +186,7 @@ def _collect_feedback_data(
     )
     nominal, effects = loop.nominal(decision), loop.effects(decision)
     return {
+        "alone": model.response.inner.noun,
         "alone_lower": nominal_tube.lower,
         "alone_upper": nominal_tube.upper,
         "control_least": nominal - loop.spread.support(-effects).T,

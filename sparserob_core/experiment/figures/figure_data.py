@@ -92,7 +92,8 @@ class FigureData:
 
     Under feedback the control is the nominal one, ``control_least``, ``control_most (m, K)`` are how far the
     disturbance moves it, ``gains (K, K, m, p)`` answer what is measured, ``outputs`` or (``None``) states, and
-    ``alone_lower``, ``alone_upper (d, T)`` is the tube that the nominal control alone has. ``effort (3, m, K)`` are
+    ``alone_lower``, ``alone_upper (d, T)`` is the tube that ``alone`` has, which is
+    the nominal control or an inner loop. ``effort (3, m, K)`` are
     quantiles of ``|u|`` over ``draws`` admissible disturbances (5 %, 50 %, 95 %), and ``answers (K, K, m)`` what the
     control on every piece adds for the innovation of every breakpoint in the ``worst_case`` that is named; each where
     it was asked for.
@@ -116,6 +117,7 @@ class FigureData:
     cost_scale: float = 0.0
     cost_of: str = ""
     cost_unit: str = ""
+    alone: str = "the nominal control"
     alone_lower: Array | None = None
     alone_upper: Array | None = None
     control_least: Array | None = None

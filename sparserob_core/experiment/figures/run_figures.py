@@ -129,7 +129,7 @@ def draw_states(data: FigureData) -> Figure:
                     linewidth=0.9,
                     linestyle=(0, (4, 2)),
                     zorder=2,
-                    label="worst case of the nominal control alone",
+                    label=f"worst case of {data.alone} alone",
                 )
         for edge in (data.tube_lower[component], data.tube_upper[component]):
             ax.plot(data.times, edge, color=look.SKY, linewidth=0.8, zorder=2)

@@ -101,3 +101,8 @@ def test_a_response_without_its_inner_loop_is_that_of_the_plant() -> None:
     bare = Response(response.system, response.grid, response.initial_state)
     for found, expected in zip(response.bare.weights(*index), bare.weights(*index), strict=True):
         assert np.array_equal(found, expected)
+
+
+def test_figures_name_what_acts_before_anything_is_answered() -> None:
+    assert InnerLoop().noun == "the nominal control"
+    assert InnerLoop(np.zeros((1, 1, 1)), np.zeros(1)).noun == "the inner loop"
