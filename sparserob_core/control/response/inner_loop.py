@@ -72,7 +72,7 @@ class InnerLoop:
 
     @property
     def noun(self) -> str:
-        """What acts before anything is answered, in words."""
+        """Name of the part of the control that acts before anything is answered."""
         return "the inner loop" if self.acts else "the nominal control"
 
     def in_units(self, units: Any) -> InnerLoop:
