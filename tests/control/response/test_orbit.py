@@ -284,17 +284,3 @@ def test_numbers_have_as_many_bits_as_the_growth_takes() -> None:
     _, errors = orbit.states(landed)
     assert orbit.bits > 700 and (errors <= 2.0**-52).all()
     assert (replace(orbit, bits=192, _steps={}, _weights={}, _states={}).states(landed)[1] > 1.0).any()
-
-
-def _rest(orbit: Orbit, idle: tuple[int, ...] = ()) -> np.ndarray:
-    """A control in doubles that ends at rest but for rounding: pieces with the least sum of squares, found through the
-    backward flow, in which nothing grows."""
-    times = orbit.grid.breakpoints
-    rows = []
-    for rate in (RATE, -RATE):  # (v + rate x) e^{-rate t} changes by the integral of e^{-rate s} u
-        weight = (np.exp(-rate * times[:-1]) - np.exp(-rate * times[1:])) / rate
-        shift = 1.0 if rate > 0 else np.exp(rate * times[-1])
-        rows.append((weight * shift, -(orbit.initial_state[1] + rate * orbit.initial_state[0]) * shift))
-    matrix, wanted = np.array([row for row, _ in rows]), np.array([value for _, value in rows])
-    matrix[:, list(idle)] = 0.0
-    return np.asarray(np.linalg.lstsq(matrix, wanted, rcond=None)[0])[None]
