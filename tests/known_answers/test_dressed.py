@@ -44,7 +44,6 @@ CLASSES: list[Config] = [
     {"set": {"box": 0.02}, "E": [[1], [0]]},
 ]
 ROUND: Config = {"ellipsoid": {"centre": [0, 0], "shape": [[1.3, 0], [0, 1.0]]}}
-SMALL: Config = {"ellipsoid": {"centre": [0, 0], "shape": [[0.12, 0], [0, 0.16]]}}
 QUADRATIC: Config = {
     "l1": 1.0,
     "state": {"Q": [[0.2, 0], [0, 0.1]]},
@@ -94,7 +93,6 @@ LINES: dict[str, Config] = {
         "measurements": {"C": [[1, 0]], "noise": {"box": 0.01}, "latency": 0.1},
     },
     "affine, delay": {"policy": "nominal", "system": {**SYSTEM, "delay": 0.15}},
-    "affine, curved": {"policy": "nominal", "terminal": [SMALL]},
     "affine, integral": {"policy": "nominal", "integral": [{**INTEGRAL[0], "G": [[0]]}]},
 }
 

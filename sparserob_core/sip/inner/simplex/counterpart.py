@@ -56,6 +56,7 @@ LARGE = 200_000
 # as so many. With ten times as many one round took more than a minute; with a tenth of them small rounds begin anew.
 PATIENT = 0.25
 ROBUST = "feedback"  # what these programs are called where a solver fails on some
+PERTURBED = 1e-4  # of slopes: what a perturbed cost may leave; a hundredth of it is seen, and 1e-2 is another entry's
 PASSES = 20  # of least squares within bounds, at most: what is left of a slope after some lowers a bound, which holds
 INNER = 20  # steps of the simplex method that one of an interior point method takes as long as
 SAME = 1e-12  # points of a set that are closer are one
@@ -421,8 +422,11 @@ class Counterpart:
         is_inner = (self._x > self.program.lower) & (self._x < self.program.upper)
         is_inner &= (weights == 0.0) | (self._x != 0.0)
         is_inner[np.concatenate(answering)] = False
+        residual = slope + weights * np.sign(self._x) + y[active] @ table
+        # of an answer that is no vertex, entries near a bound or near 0 have slopes of their own
+        is_inner &= np.abs(residual) <= PERTURBED * max(1.0, float(np.abs(slope).max(initial=0.0)))
         columns = np.flatnonzero(is_inner)
-        residual = slope[columns] + weights[columns] * np.sign(self._x[columns]) + (y[active] @ table)[columns]
+        residual = residual[columns]
         if np.abs(residual).max(initial=0.0) <= ACCURACY:
             return
         shares = table[:, columns].T.toarray() * y[active]
