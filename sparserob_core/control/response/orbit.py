@@ -9,8 +9,6 @@ by the norms of all steps, however the plant turns them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
@@ -55,18 +53,6 @@ def growth(system: System, horizon: float) -> float:
     return max(0.0, rate * horizon)
 
 
-@contextmanager
-def precision(bits: int) -> Iterator[None]:
-    """Compute with so many bits in every number of a ball."""
-    from flint import ctx
-
-    before, ctx.prec = ctx.prec, bits
-    try:
-        yield
-    finally:
-        ctx.prec = before
-
-
 def column(entries: Array) -> arb_mat:
     """Return exact numbers ``(k,)`` as a column."""
     from flint import arb, arb_mat
@@ -98,14 +84,14 @@ class Measure:
     @staticmethod
     def of(A: Array) -> Measure:
         """Return the norm in the coordinates of the modes of ``A (d, d)``, with its logarithmic norm."""
-        from flint import arb_mat
+        from flint import arb_mat, ctx
 
         T = decoupled(A).transform
         candidates = [T * 2.0 ** (-shift * np.arange(len(A))) for shift in SHIFTS if shift * len(A) < DEEPEST]
         inverses = (np.linalg.inv(candidate) for candidate in candidates)
         rates = [_bound_rate((V @ A @ S).tolist()) for V, S in zip(inverses, candidates, strict=True)]
         T = candidates[int(np.argmin(rates))]
-        with precision(BITS):
+        with ctx.workprec(BITS):
             exact = arb_mat(T.tolist())
             inverse = exact.inv()
             rate = float(_bound_rate((inverse * arb_mat(A.tolist()) * exact).tolist()).upper())
@@ -176,8 +162,10 @@ class Orbit:
 
     def _follow(self, inputs: Array) -> tuple[Array, Array]:
         """Return `states` under ``inputs (m, L)`` on the pieces."""
+        from flint import ctx
+
         modes = [mode for mode, _ in self._pieces]
-        with precision(self.bits):
+        with ctx.workprec(self.bits):
             steps, state = self._compute_steps(), column(self.initial_state)
             path, missed = [state], []
             for step, entries in zip(self._pieces, inputs.T, strict=True):
@@ -215,11 +203,13 @@ class Orbit:
         later ones make up for that: their last digits move the final state by less. The control itself is returned
         where more than rounding is missing.
         """
+        from flint import ctx
+
         entries, (lower, upper) = control.T.ravel(), (np.tile(limit, control.shape[1]) for limit in limits)  # by pieces
         most = NEARLY * np.abs(entries).max(initial=0.0)
         is_inside = (entries > lower + most) & (entries < upper - most)
         moving, idle = (np.flatnonzero(is_inside & mask) for mask in (entries != 0.0, entries == 0.0))
-        with precision(self.bits):
+        with ctx.workprec(self.bits):
             effects, missing = self._find_effects(control, H, values)
             landed, left = _round_towards(entries, moving, effects, missing, most)
             if left > SHORT * float(np.abs(values).max() + np.abs(self.states(control)[0] @ H.T).max()):

@@ -26,7 +26,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.terms.windows import end_of
 from sparserob_core.control.problem.units import Units, power_of_two
-from sparserob_core.control.reach.sizes import widths as widths_of
+from sparserob_core.control.reach.sizes import row_sizes
 from sparserob_core.control.response.inner_loop import InnerLoop
 from sparserob_core.control.transcription.own_units import added_up, constraint_sides, fixed, units_of_steps
 from sparserob_core.control.transcription.program import EQUALS, ranges, transcribed
@@ -482,9 +482,7 @@ def _normalise_rows(constraints: Sequence[StateConstraint], d: int) -> Array:
     rows = [np.zeros((0, d))]
     for constraint in constraints:
         assert constraint.sides is not None
-        H, h = constraint_sides(constraint)
-        width = widths_of(H, h)
-        sizes = np.maximum(np.abs(h), np.where(np.isfinite(width), width, 0.0))
+        sizes = row_sizes(*constraint_sides(constraint))
         rows.append(constraint.sides[0] / np.where(sizes > 0.0, sizes, 1.0)[:, None])
     return np.vstack(rows)
 

@@ -144,11 +144,10 @@ class _TranslatedCase(_Case):
     are nearly parallel cancel, and doubles do not hold what is left.
     """
 
-    outer: FiniteProgram | None = None
-    easier: NewVariables | None = None
+    outer: FiniteProgram = field(kw_only=True)
+    easier: NewVariables = field(kw_only=True)
 
     def judge(self, solution: FiniteSolution, name: str, by: str = "") -> FiniteSolution | None:
-        assert self.outer is not None and self.easier is not None
         worth = _measure_translated(self.outer, self.easier, solution)
         lower = max(worth.lower_bound, solution.lower_bound) if self.outer.b.size else worth.lower_bound
         judged = replace(solution, lower_bound=lower, gap=solution.value - lower, residual=worth.residual)
