@@ -564,6 +564,8 @@ def _compare_solution(stored: StoredRun, case: Case) -> Verdicts:
         )
     except InputError as error:
         return [f"it cannot be read: {error}"], "", []
+    except Broken as error:
+        return [f"the certificate has no control: {error}"], "", []
     except KeyError as error:
         return [f"it holds no array {error}"], "", []
     except (ValueError, TypeError, OverflowError):

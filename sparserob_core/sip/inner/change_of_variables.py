@@ -104,7 +104,7 @@ def _divide_rows(program: FiniteProgram) -> NewVariables | None:
     they are ``a f + r`` with small ``r``. With the variable ``v = f'x / unit`` they become ``(a unit) v + r'x``, which
     are ordinary numbers. Along the directions of equalities ``f'x`` is known, and no variable is needed.
 
-    Returns ``None`` where rows are ordinary, and where too many directions are large.
+    Returns ``None`` where rows are ordinary, where too many directions are large, and where every large row has one.
     """
     if program.blocks is not None or not (program.h.size or program.b.size) or program.b.size > program.n:
         return None
@@ -114,7 +114,8 @@ def _divide_rows(program: FiniteProgram) -> NewVariables | None:
     if not sizes.min(initial=np.inf) > DEPENDENT * sizes.max(initial=0.0):  # some equalities say the same
         return None
     is_uneven = bool(sizes.size) and sizes.max() > LARGE * sizes.min()
-    if not is_uneven and not (np.abs(program.G) @ reach > LARGE).any():
+    large = int(np.count_nonzero(np.abs(program.G) @ reach > LARGE))
+    if not is_uneven and not large:
         return None
     fixed = program.G @ Q.T
     rest = program.G - fixed @ Q
@@ -129,7 +130,7 @@ def _divide_rows(program: FiniteProgram) -> NewVariables | None:
         F = np.vstack([F, direction])
         for _ in range(2):  # the second time for what rounding has left
             rest = rest - (rest @ F.T) @ F
-    if not is_uneven and not len(F):
+    if not is_uneven and len(F) in (0, large):
         return None
     moving = (program.G - fixed @ Q) @ F.T
     units = 1.0 / np.exp2(np.round(np.log2(np.abs(moving).max(axis=0, initial=1.0))))

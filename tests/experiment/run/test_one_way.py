@@ -19,7 +19,8 @@ PLACES = (
     "experiment/run/run.py",
     "checker/claims/",
 )
-# how few pieces can act is claimed of a control that answers nothing, whose families have rows of the decision
+# how few pieces can act is claimed of a control that answers nothing, whose families have rows of the decision and
+# whose last digits are chosen such that it lands
 # and the checker's loops of what does not change with time do not go through its flow yet
 ALONE = {
     "checker.claims.case.Case.flows",
@@ -32,6 +33,7 @@ ALONE = {
     "control.transcription.program.OpenLoopModel.",
     "control.transcription.program._block_units",
     "control.transcription.program._build_reduced_family",
+    "control.transcription.program._land",
     "control.transcription.program.family_of",
     "sip.methods.fewest.",
 }

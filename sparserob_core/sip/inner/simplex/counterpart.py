@@ -346,7 +346,8 @@ class Counterpart:
         slope = mu @ self.program.A + (0.0 if self.elastic else priced.q)
         slope = slope + np.bincount(column, value, self.program.n)
         is_balanced = self._balance_slopes(slope, deviations, late)
-        self._refine_deviations(slope, ~is_balanced & (priced.weights == 0.0), y, deviations)
+        free = self._find_inner_variables() & ~is_balanced & (priced.weights == 0.0)
+        self._refine_deviations(slope, free, y, deviations)
         if not self.spread.is_box:
             deviations = deviations + DRAWN * (self.spread.inner - deviations)
         return y, deviations
@@ -407,6 +408,10 @@ class Counterpart:
             deviations[rows] = np.sign(block.factor[at])[:, None] * w
         return reach > 0.0
 
+    def _find_inner_variables(self) -> np.ndarray:
+        """Return which entries ``(n,)`` of the last answer are between their bounds: others may keep a slope."""
+        return (self._x > self.program.lower) & (self._x < self.program.upper)
+
     def _refine_multipliers(self, slope: Array, weights: Array, y: Array) -> None:
         """Correct multipliers, such that less is left of slopes in the variables that answer nothing, and are between
         their bounds.
@@ -419,8 +424,7 @@ class Counterpart:
             return
         table = csr_array(vstack([block.g for block in self.blocks]))[active]
         answering = [C.indices for block in self.blocks for C in block.C]
-        is_inner = (self._x > self.program.lower) & (self._x < self.program.upper)
-        is_inner &= (weights == 0.0) | (self._x != 0.0)
+        is_inner = self._find_inner_variables() & ((weights == 0.0) | (self._x != 0.0))
         is_inner[np.concatenate(answering)] = False
         residual = slope + weights * np.sign(self._x) + y[active] @ table
         # of an answer that is no vertex, entries near a bound or near 0 have slopes of their own
