@@ -71,6 +71,6 @@ def test_between_a_point_and_a_set_nothing_is_lost(seed: int, thick: float, tmp_
 
 def test_the_draws_hold_every_kind_of_set_thickness_place_and_policy() -> None:
     every = [draw(seed) for seed in range(240)]
-    assert len({(one.kind, one.thick, one.place, one.policy) for one in every}) == 5 * 3 * 4 * 2
+    assert len({(one.kind, one.thick, one.place, one.policy) for one in every}) == 5 * 3 * 4 * 2 - 2 * 3 * 2
     spans = [one.disturbance or one.initial for one in every if one.place in ("disturbance", "initial")]
     assert {span.V.shape for span in spans if span is not None} == {(2, 0), (2, 1), (3, 0), (3, 1), (3, 2)}

@@ -274,7 +274,6 @@ KINDS: dict[str, Config] = {
     ),
     "round": changed(
         SPRING,
-        ANSWERING,
         disturbance={"box": [0.05]},
         terminal=[{"ellipsoid": {"centre": [0, 0], "shape": [[0.2, 0], [0, 0.2]]}}],
     ),

@@ -76,7 +76,7 @@ def _config_of(kind: str, thick: float, span: Span, rng: np.random.Generator) ->
 
 
 def draw(seed: int) -> Problem:
-    """One of them; by its number every kind, thickness, place and policy in turn."""
+    """One of them; by its number every kind, thickness, place and policy in turn. Feedback has no curved states."""
     rng = np.random.default_rng([41, seed])
     kinds = ("box", "polytope", "norm", "ellipsoid", "zonotope")
     kind, thick, place, policy = (
@@ -85,6 +85,8 @@ def draw(seed: int) -> Problem:
         PLACES[seed // 15 % 4],
         POLICIES[seed // 60 % 2],
     )
+    if kind in POINTS and place in ("terminal", "path"):
+        policy = "open_loop"
     d, pieces = 2 + int(seed % 3 == 2), int(rng.integers(4, 7))
     A = np.eye(d, k=1) + (rng.normal(scale=0.4, size=(d, d)) if rng.random() < 0.7 else 0.0)
     B = np.eye(d)[:, d - 1 :]
