@@ -271,6 +271,9 @@ class ConstraintFamily:
         `Spread`. Such a family is not linear in the decision: ``rows`` refuses, and ``excess`` is offered.
     excess : callable, optional
         ``excess(x, indices (k, d))``: the violations ``(k, r)`` at indices, computed without building rows.
+    rounding : callable, optional
+        ``rounding(x, indices (k, d))``: bounds ``(k, r)`` of the rounding errors of ``row x - rhs``, where these may
+        exceed 1e-14 of the row and its right-hand side, since terms cancel. Lower bounds count them.
     start : ndarray, shape (k, d), optional
         Indices that a method imposes first, for a family with ``uncertain`` rows.
     defines : bool, default False
@@ -314,6 +317,7 @@ class ConstraintFamily:
     coordinates: Sequence[str] = ()
     uncertain: Callable[[Array], UncertainRows] | None = None
     excess: Callable[[Array, Array], Array] | None = None
+    rounding: Callable[[Array, Array], Array] | None = None
     start: Array | None = None
     defines: bool = False
     scaled: Callable[[float], ConstraintFamily] | None = None
@@ -394,6 +398,7 @@ class ConstraintFamily:
             rows=expressions.evaluate,
             enclosure=enclose,
             excess=expressions.violations,
+            rounding=expressions.roundings,
             sharpness=EXPRESSED,
             explain=lambda index, row: Unexplained(f"{name}, {expressions.rows[row].text} at {piece.describe(index)}"),
             coordinates=piece.labels,

@@ -143,6 +143,21 @@ class ExpressionRows:
             self._require_values(row, indices, np.isfinite(column[:, 0]))
         return np.concatenate(columns, axis=1)
 
+    @shaped
+    def roundings(self, x: Float[Array, " n"], indices: Float[Array, "k d"]) -> Float[Array, "k r"]:
+        """Return bounds of the rounding errors of the violations ``G x - h`` that `evaluate` gives at indices.
+
+        Where the terms of a row cancel, the error is no share of what is left of them.
+        """
+        G, h = self.evaluate(indices)
+        space = taylor_space(self.dimension, 1)
+        variables, decision = self._variables(space, indices, indices), CellModels.constant(space, x[None])
+        parts: dict[str, Value] = {}
+        models = [self._as_models(row.value(variables, decision, parts), space) for row in self.rows]
+        values = np.stack([np.broadcast_to(model.coefficients[:, 0, 0], len(indices)) for model in models], axis=1)
+        errors = np.stack([np.broadcast_to(model.remainder[:, 0], len(indices)) for model in models], axis=1)
+        return np.asarray(errors + np.abs(values - (G @ x - h)))
+
     def _as_models(self, value: object, space: TaylorSpace) -> CellModels:
         return value if isinstance(value, CellModels) else CellModels.constant(space, np.asarray(value, dtype=float))
 

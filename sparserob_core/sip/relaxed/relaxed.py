@@ -259,8 +259,24 @@ class RelaxedProgram:
             *(self._prove_bound(plain, solution, *offer) for offer in offers),
         ]
         bound, y, mu, z, at = proven[int(np.argmax([proof[0] for proof in proven]))]
+        bound -= self._bound_row_errors(rows, y[y.size - rows.h.size :], solution.x)
         curved = plain.P is not None or plain.blocks is not None
         return self.dual(rows, y, mu, solution.z if z is None else z, bound, at if curved else None)
+
+    def _bound_row_errors(self, rows: Rows, y: Array, x: Array) -> float:
+        """Return the error that rounding may cause in a lower bound where terms of rows cancel, for ``x (n,)``
+        nearby."""
+        used: dict[str, list[int]] = {}
+        for i in np.flatnonzero(y > 0.0).tolist():
+            used.setdefault(rows.cuts[i].family, []).append(i)
+        total, nearby = 0.0, np.where(np.isfinite(x), x, 0.0)
+        for name, positions in used.items():
+            rounding = self.program.family(name).rounding
+            if rounding is not None:
+                cuts = [rows.cuts[i] for i in positions]
+                errors = rounding(nearby, np.array([cut.index for cut in cuts]))
+                total += float(y[positions] @ errors[np.arange(len(cuts)), [cut.row for cut in cuts]])
+        return total
 
     def _bound_without_multipliers(self, plain: FiniteProgram, solution: FiniteSolution) -> _Proven:
         """The bound of no multipliers at all, which is the same again and again where the cost is linear."""

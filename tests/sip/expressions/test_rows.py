@@ -3,6 +3,7 @@ where there is none."""
 
 from __future__ import annotations
 
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -175,3 +176,23 @@ def test_a_family_of_python_names_its_text() -> None:
     )
     G, h = family.rows(np.array([[0.5]]))
     assert G.tolist() == [[[-1.0, -1.0]]] and h.tolist() == [[-0.5]]
+
+
+def test_rounding_errors_of_rows_are_bounded_where_their_terms_cancel() -> None:
+    """Against fractions, of polynomials whose terms are up to a million times as large as their sums."""
+    rng, decision = np.random.default_rng(8), Decisions({"x": 2})
+    texts = ["x[0]*((1 + t)**6 - 1) <= x[1] - t^2", "x[1]*t <= (t + 3)**5 - t**5 - 243"]
+    rows = ExpressionRows.parse({"t": (-1.0, 1.0)}, texts, decision, {})
+    indices, x = 10.0 ** rng.uniform(-9.0, 0.0, (200, 1)), rng.normal(size=2)
+    G, h = rows.evaluate(indices)
+    bounds, largest = rows.roundings(x, indices), 0.0
+    assert bounds.shape == (200, 2)
+    for k, index in enumerate(indices[:, 0].tolist()):
+        t, (a, b) = Fraction(index), (Fraction(number) for number in x.tolist())
+        exact = a * ((1 + t) ** 6 - 1) - b + t**2, b * t - (t + 3) ** 5 + t**5 + 243
+        for row in range(2):
+            value = sum(Fraction(float(c)) * n for c, n in zip(G[k, row], (a, b), strict=True)) - Fraction(h[k, row])
+            error = float(abs(value - exact[row]))
+            assert error <= bounds[k, row]
+            largest = max(largest, error / bounds[k, row])
+    assert largest > 1e-3

@@ -4,6 +4,7 @@ same with lazy rows as with all of them."""
 from __future__ import annotations
 
 from dataclasses import replace
+from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
@@ -235,3 +236,18 @@ def test_a_bound_is_recorded_with_the_very_multipliers_that_prove_it(piqp):
         priced = by_linear_programming("", replace(free, q=free.q + y @ rows.G))
         assert dual.bound <= priced.highest - y @ rows.h
     assert moved >= 5
+
+
+@pytest.mark.parametrize("power", [1e-7, 1e-9])
+def test_a_lower_bound_counts_the_rounding_of_terms_that_cancel(power: float) -> None:
+    """The largest ``t - t^(1 + p)`` is about ``p/e``, and both terms about ``1/e``."""
+    text = f"-(t^{1.0 + power!r}) + t <= r"
+    family = sr.ConstraintFamily.from_expressions("f", index={"t": (0, 1)}, rows=[text], decision={"r": None})
+    result = sr.solve(sr.SemiInfiniteProgram(n=1, q=[1], families=[family]))
+    with localcontext() as context:
+        context.prec = 50
+        a = Decimal(1.0 + power)
+        t = a ** (-1 / (a - 1))
+        exact = t - t**a
+        assert Decimal(result.lower_bound) <= exact
+    assert result.lower_bound == pytest.approx(float(exact), rel=0.1)
