@@ -19,7 +19,7 @@ from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.transcription.own_units import fixed
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.control.transcription.rounding import SHARE, added_up, rounded_down
+from sparserob_core.control.transcription.rounding import ROW_ROUNDING, added_up, rounded_down
 from sparserob_core.control.transcription.transcribe import from_state
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
@@ -123,7 +123,7 @@ class InitialPlane:
             return np.zeros(times.size)
         columns = response.weights(times, directions, parameters).free[:, list(self.states)] * self.radius
         sizes = added_up(self.centred, times, directions, parameters) + np.abs(columns).sum(axis=1)
-        return np.asarray((SHARE + response.propagator.slack) * sizes + np.abs(directions) @ self.beyond)
+        return np.asarray((ROW_ROUNDING + response.propagator.slack) * sizes + np.abs(directions) @ self.beyond)
 
     def _bound_row_error(self, cut: Cut) -> float:
         """Return the error bound of a row that holds with equality, under feedback; 0 for other rows, which are wider

@@ -34,7 +34,8 @@ UNFINISHED = "the run has not finished"
 NUMBERS = ("cost", "value", "epsilon", "lower_bound", "upper_bound", "gap", "seconds")
 # arrays of a feedback decision: gains, the observer where outputs are measured, and the gains of an inner loop
 ANSWERS = ("gains", "observer", "prestabilise")
-SAME = 1e-9  # difference that is allowed between dependent arrays, as a share of the largest number of the array
+# Difference that is allowed between dependent arrays, as a share of the largest number of the array
+ARRAY_TOLERANCE = 1e-9
 MAX_TEXT = 2**27
 """Largest number of bytes of a JSON file. The largest that runs write have some 10 million; with ten times the limit a
 file could take all memory of a machine."""
@@ -56,7 +57,7 @@ class StoredRun:
     """The files of a run directory, each read when it is first needed.
 
     Every property raises `InputError` that names its file, where this is missing, cannot be read or does not fit. It
-    does so too where its arrays take more than ``largest`` bytes (`LARGEST` unless given).
+    does so too where its arrays take more than ``largest`` bytes (`MAX_ARRAY_BYTES` unless given).
     """
 
     directory: Path
@@ -239,7 +240,7 @@ class FinishedRun:
                 stored is None
                 or stored.size != value.size
                 or stored.dtype.kind != "f"
-                or not (np.abs(stored.ravel() - value.ravel()) <= SAME * size).all()
+                or not (np.abs(stored.ravel() - value.ravel()) <= ARRAY_TOLERANCE * size).all()
             ):
                 raise InputError(
                     f"{self.directory / 'solution.npz'}: {name}: expected what follows from the decision beside it, got"

@@ -28,7 +28,7 @@ INK, GREY, MIST = "#222222", "#7A7A7A", "#E9E9E9"
 EXCLUDED: dict[str, Any] = {"facecolor": MIST, "edgecolor": "#C4C4C4", "hatch": "////", "linewidth": 0, "zorder": 0}
 """How an area is drawn in which nothing may be, or nothing is."""
 
-WIDTH = 6.2
+FIGURE_WIDTH = 6.2
 """Width of every figure in inches: a text column at full size."""
 
 LETTERS, MARKER_LETTERS = 104, 8
@@ -86,7 +86,7 @@ def panels(rows: int, height: float, *, extra: float = 0.0) -> tuple[Figure, lis
     legends."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(WIDTH, rows * height + 0.75 + extra), layout="constrained")
+    figure = Figure(figsize=(FIGURE_WIDTH, rows * height + 0.75 + extra), layout="constrained")
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
     return figure, list(axes)
 

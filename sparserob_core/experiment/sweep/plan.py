@@ -28,7 +28,7 @@ from sparserob_core.sip.events import Notify, ignore
 FILE = "sweep.yaml"
 HEADING = "A study. To go on with it, or to repeat it elsewhere: sparserob sweep sweep.yaml --out DIRECTORY"
 KEYS = ("base", "overrides", "axes", "points", "number", "seed")
-OFTEN = 100  # number of configs between two reports of their check
+CONFIGS_PER_REPORT = 100  # number of configs between two reports of their check
 Arrangement = Literal["grid", "zip", "random", "sobol"]
 ARRANGEMENTS: tuple[Arrangement, ...] = ("grid", "zip", "random", "sobol")
 
@@ -166,7 +166,7 @@ class Plan:
         for values in rows:
             plain = self.loaded(values).config.plain()
             points.append(Point(values, json.dumps(plain), identity(plain)))
-            if len(points) % OFTEN == 0:
+            if len(points) % CONFIGS_PER_REPORT == 0:
                 text = f"{len(points)} of {len(rows)} configs are checked"
                 notify(StudyProgress(text=text, done=len(points), total=len(rows)))
         return points

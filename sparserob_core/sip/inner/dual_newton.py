@@ -23,15 +23,15 @@ from sparserob_core.sip.inner.change_of_variables import in_new_variables
 from sparserob_core.sip.inner.duality import bent_minimisers, measure
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 
-ITERATIONS = 60
-PATIENCE = 10
+NEWTON_ITERATIONS = 60
+IDLE_STEPS = 10
 SEARCH = 25
 TARGET = 1e-12
 TINY = float(np.finfo(float).tiny)
 DAMPING, DAMPED = 1e-13, 1e4  # of the trace of a Hessian, and what that becomes where a step climbs nothing
 # below this, relative to the linear cost, the curvature amplifies round-off too much for Newton's method alone
-FLAT = 1e-4
-STILL = 1e-9  # a proximal point that moves by less, relative to the decision, has arrived
+MIN_CURVATURE_SHARE = 1e-4
+SAME_POINT_DISTANCE = 1e-9  # a proximal point that moves by less, relative to the decision, has arrived
 HEAVIEST, LIGHTEST = 1e6, 1e-9  # weights of a proximal point, of the largest coefficient of the cost
 LIGHTER, HEAVIER = 0.1, 30.0  # what a weight becomes after a proximal point that was found, and one that was not
 NOT_SEPARABLE = "its quadratic cost couples variables: a separable program is needed"
@@ -103,7 +103,7 @@ def from_nothing(program: FiniteProgram, accuracy: float, points: int) -> tuple[
     y, mu, x = np.zeros(program.h.size), np.zeros(program.b.size), np.clip(0.0, program.lower, program.upper)
     best = measure(program, x, y, mu, message="nothing")
     weight, idle, number = cost, 0, 0
-    while number < points and idle <= PATIENCE and weight <= HEAVIEST * cost:
+    while number < points and idle <= IDLE_STEPS and weight <= HEAVIEST * cost:
         number += 1
         if weight <= least:
             near = newton_solve(program, y, mu)  # it is bent enough itself
@@ -132,7 +132,7 @@ def polish(
     curvature = program.curvature if program.separable else None
     if curvature is None or x.shape != program.q.shape or y.shape != program.h.shape or mu.shape != program.b.shape:
         return None
-    is_curved = float(curvature.min(initial=np.inf)) >= FLAT * program.steepest
+    is_curved = float(curvature.min(initial=np.inf)) >= MIN_CURVATURE_SHARE * program.steepest
     solution = newton_solve(program, y, mu, x0=x) if is_curved else None
     return proximal_polish(program, x, y, mu) if solution is None else solution
 
@@ -168,7 +168,7 @@ def proximal_polish(
             break
         if (
             not is_flat
-            and distance <= STILL * (1.0 + float(np.abs(x).max(initial=0.0)))
+            and distance <= SAME_POINT_DISTANCE * (1.0 + float(np.abs(x).max(initial=0.0)))
             and weight <= 2 * curvature.min()
         ):
             break
@@ -252,8 +252,8 @@ def newton_solve(
     program: FiniteProgram,
     y0: Float[Array, " r"],
     mu0: Float[Array, " e"] | None = None,
-    steps: int = ITERATIONS,
-    patience: int = PATIENCE,
+    steps: int = NEWTON_ITERATIONS,
+    patience: int = IDLE_STEPS,
     x0: Float[Array, " n"] | None = None,
 ) -> FiniteSolution | None:
     """Return the optimum of a program with identity image and a positive diagonal ``P``, from dual variables

@@ -175,7 +175,7 @@ def test_a_file_that_pretends_to_hold_much_is_refused_unread(tmp_path: Path, mon
         archive.writestr("A.npy", head.getvalue())
     with pytest.raises(sr.ConfigError):
         load_config(config)
-    monkeypatch.setattr(files, "LARGEST", 100)
+    monkeypatch.setattr(files, "MAX_MATRIX_FILE_BYTES", 100)
     np.savez_compressed(tmp_path / "given" / "plant.npz", A=np.zeros((50, 50)))
     with pytest.raises(sr.ConfigError, match="at most 100 bytes"):
         load_config(config)
