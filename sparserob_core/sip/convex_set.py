@@ -19,6 +19,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import Array as Array  # noqa: PLC0414  where the rest of the core takes it from
 from sparserob_core.shapes import Bool, Float, sealed, shaped
 
+# After which an interval of doubles is as short as rounding; with half of them a root has nine digits.
 BISECTION_HALVINGS = 60
 RELATIVE = 1e-12  # accuracy of a gauge that is computed from the support function alone
 PIVOTS = 500  # largest number of support points computed for one boundary point

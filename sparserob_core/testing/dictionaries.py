@@ -13,7 +13,7 @@ HORIZONS = (1.0, 0.3, 2.5, 1 / 3, 1e-3, 5400.0, 1.0)
 CONDITION = 1e10  # of the Gram matrix of the functions, each of norm 1
 SIZES = (1e-6, 1e6)  # of the largest value of a function
 SHORTEST_PIECE = 1e-9  # piece, as a share of the horizon
-MAX_PIECES = 20_000  # pieces
+DICTIONARY_PIECES = 20_000  # pieces
 
 
 class DictionaryContract(Contract[DictionaryFactory], kind="dictionary"):
@@ -62,11 +62,11 @@ class DictionaryContract(Contract[DictionaryFactory], kind="dictionary"):
                 f"join pieces shorter than {SHORTEST_PIECE:g} of the horizon with their neighbours: rounding eats them",
             )
             demand(
-                1 <= dictionary.values.shape[1] <= MAX_PIECES
+                1 <= dictionary.values.shape[1] <= DICTIONARY_PIECES
                 and dictionary.values.shape[1] == dictionary.breakpoints.size - 1,
                 f"build({horizon:g}) has values on {dictionary.values.shape[1]} of "
                 f"{dictionary.breakpoints.size - 1} pieces",
-                f"values have one column for each piece, of at most {MAX_PIECES} pieces",
+                f"values have one column for each piece, of at most {DICTIONARY_PIECES} pieces",
             )
 
     def test_its_functions_are_linearly_independent(self) -> None:

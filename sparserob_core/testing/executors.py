@@ -22,7 +22,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.method import ExecutorFactory
 from sparserob_core.testing.contract import Contract, broken, demand
 
-CALLS = 12
+CALLS = 12  # that are submitted at once
 CALL_SECONDS = 0.05  # seconds that a call takes where it has to take some
 
 

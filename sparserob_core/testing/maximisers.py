@@ -25,7 +25,7 @@ FIRST_POINT = 0.25
 """Seconds until a search has to ask for its first value, the best of `MEASURED_STARTS`, for a method begins one in
 every iteration: ten times as long would let a second pass, and a tenth is what a loaded machine takes now and then."""
 
-MEASURED_STARTS = 3
+MEASURED_STARTS = 3  # whose best counts, since a loaded machine delays one
 
 
 def slope(points: Array) -> Array:

@@ -26,7 +26,7 @@ from sparserob_core.testing.contract import Contract, broken, demand, same
 
 DIP, WIDTH = 0.73713, 0.003  # where the narrow dip of `dipping` is, and how narrow
 CLAIM_ACCURACY = 1e-6  # relative accuracy with which a claim is compared with what is known
-DRAWN_SAMPLES = 4_000
+DRAWN_SAMPLES = 4_000  # of an index set, at which a decision is examined; a tenth of them lie in the dip
 HONEST = "claim no more than was proven: `certified` and `verified` only where every family is proven at the decision"
 
 

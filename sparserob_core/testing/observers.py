@@ -60,7 +60,7 @@ METHODS: Mapping[str, Mapping[str, Any]] = {
     "infeasible": {"problem": {**CONFIG["problem"], "horizon": 0.5, "path": []}},
 }
 BROKEN_OFF = (1, 2, 4)  # the events after which a run is interrupted: at once, and in the middle
-MEASURED_EVENTS = 300
+MEASURED_EVENTS = 300  # of which the median time is taken
 THREAD_GRACE_SECONDS = 5.0  # seconds that an observer may take to end its threads
 FRAMEWORK = "this is a fault of the framework, or of the contract; please report it"
 MAX_SECONDS_PER_EVENT = 2e-3  # seconds that an event may take on the solver's thread, the median of many

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 DECISIONS = 4  # decisions at which families are looked at
 DRAWN_INDICES = 60  # indices that are drawn
 DRAWN_CELLS = 10  # cells that are drawn, with `INDICES_PER_CELL` indices in each
-INDICES_PER_CELL = 25
+INDICES_PER_CELL = 25  # that are drawn in each of them
 DIFFERENCE_STEP = 1e-6  # of the box's side, for differences
 DERIVATIVE_ACCURACY = 1e-3  # relative accuracy of a derivative
 ROW_ACCURACY = 1e-8  # relative to the terms of a row

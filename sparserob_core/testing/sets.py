@@ -10,7 +10,7 @@ from sparserob_core.control.sets.sets import SetFactory
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.testing.contract import Contract, demand
 
-DRAWN_DIRECTIONS = 400
+DRAWN_DIRECTIONS = 400  # in which a set is measured, beside the axes
 EXTENT_ACCURACY = 1e-7  # relative to the set's extent
 
 

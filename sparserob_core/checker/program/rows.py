@@ -28,7 +28,7 @@ many cells, twice as many take four times as long for each."""
 SHARPENED_SHARE = 0.01
 # Halvings for that: ten times as many follow what really violates to the last digit, two are too few
 SHARPENING_HALVINGS = 5
-MAX_CELLS = 20_000  # of one row: ten times as many take hours, a tenth refuses filters of a thousand taps
+MAX_ROW_CELLS = 20_000  # of one row: ten times as many take hours, a tenth refuses filters of a thousand taps
 
 
 def bound_violation(rows: ExpressionRows, x: Array, limit: float, clock: Clock) -> float:
@@ -45,8 +45,8 @@ def bound_violation(rows: ExpressionRows, x: Array, limit: float, clock: Clock) 
         clock.check()
         lower, upper, sharpened, open_rows = work.pop()
         bounded += len(open_rows)
-        if bounded > MAX_CELLS * len(rows.rows):
-            raise Unchecked(f"more than {MAX_CELLS} cells of each row such as {open_rows[0].text!r} are needed")
+        if bounded > MAX_ROW_CELLS * len(rows.rows):
+            raise Unchecked(f"more than {MAX_ROW_CELLS} cells of each row such as {open_rows[0].text!r} are needed")
         bounds, models = _bound_cell(rows, open_rows, frame, decision, lower, upper)
         is_closed = bounds <= (SHARPENED_SHARE * limit if sharpened < SHARPENING_HALVINGS else limit)
         worst = max(worst, bounds[is_closed].max(initial=-np.inf))

@@ -13,7 +13,7 @@ SMALLEST_STEP_SHARE = 1e-6  # of the first step: a step that is not made smaller
 CLIMBED_MAXIMA = 16  # maxima along time at which a curved set is left, that are climbed from
 NEARER, LOOKS = 8, 2  # the others are narrowed down to so many times nearer, and so often
 UNSURE = 4.0  # by how much the rise that a parabola predicts may be wrong
-SAME_MAXIMUM_DISTANCE = 1e-6  # found maxima that are one, in times and on the cube of directions
+SAME_FOUND_DISTANCE = 1e-6  # found maxima that are one, in times and on the cube of directions
 # Indices of a curved set that are found at once, and those told where nothing is violated. With ten times fewer of the
 # first, rounds grow with the length of a wall that is ridden; with ten times more, there are more than help.
 MAX_RETURNED, FEWEST_RETURNED = 64, 8
@@ -213,7 +213,7 @@ def _select_distinct(indices: Array, found: Array) -> np.ndarray:
     remaining, kept = np.argsort(-found, kind="stable"), []
     while remaining.size:
         kept.append(int(remaining[0]))
-        remaining = remaining[(np.abs(indices[remaining] - indices[remaining[0]]) > SAME_MAXIMUM_DISTANCE).any(axis=1)]
+        remaining = remaining[(np.abs(indices[remaining] - indices[remaining[0]]) > SAME_FOUND_DISTANCE).any(axis=1)]
     return np.array(kept, dtype=int)
 
 

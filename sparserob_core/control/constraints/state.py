@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import NEGLIGIBLE_COEFFICIENT, ConstraintSource, TimedExplanation
+from sparserob_core.control.constraints.explanation import NEGLIGIBLE_TERM, ConstraintSource, TimedExplanation
 from sparserob_core.control.problem.names import unit_of_row
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.reach.functional import WorstFunctionals
@@ -214,7 +214,7 @@ class StateConstraint(ConstraintSource):
             assert self.sides is not None
             normals = self.sides[0][row : row + 1]
         size = np.abs(normals)
-        return np.asarray((size > NEGLIGIBLE_COEFFICIENT * size.max(initial=0.0)).any(axis=0))
+        return np.asarray((size > NEGLIGIBLE_TERM * size.max(initial=0.0)).any(axis=0))
 
     @property
     def measured(self) -> tuple[str, ...]:

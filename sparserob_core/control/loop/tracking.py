@@ -27,7 +27,7 @@ from sparserob_core.sip.program import TOLERANCE
 PARTS, LEVELS = 32, 3  # a cell that is open is cut in so many parts, so many times
 MIN_LEVEL = 2  # the level on which the instant of a new row lies at least
 TAYLOR_TERMS = 8  # of the Taylor expansion that bounds a curvature
-SUM_ROUNDING = 2.0**-46  # of the numbers that are added up
+PLAN_ROUNDING = 2.0**-46  # of the numbers that are added up
 TIGHTENING = 2e-9  # by which rows are tightened, in their own units
 MAX_ROUNDS = 40  # of adding rows
 MAX_MAP_NUMBERS = 8_000_000  # in the map from controls to states, at most
@@ -169,15 +169,15 @@ class Tracking:
             )
         self._flat_nodes = self.nodes.reshape(-1, self.nodes.shape[2])
         self._power_magnitudes = np.abs(self.powers)
-        self._row_roundings = SUM_ROUNDING * np.abs(self.H).T
+        self._row_roundings = PLAN_ROUNDING * np.abs(self.H).T
         number = np.arange(self.K + 1)[:, None]
         self._is_active_node = (number >= self.start) & (number <= self.stop)
         self._is_active_piece = (number[:-1] >= self.start) & (number[:-1] < self.stop)
         effects = np.abs(self._support_values)
-        self._rounding_errors = self.sizes @ self._row_roundings + SUM_ROUNDING * (
+        self._rounding_errors = self.sizes @ self._row_roundings + PLAN_ROUNDING * (
             np.abs(self.h) + effects.max(axis=0, initial=0.0)
         )
-        self._rounding_errors = self._rounding_errors + SUM_ROUNDING * magnitudes
+        self._rounding_errors = self._rounding_errors + PLAN_ROUNDING * magnitudes
         self._recent_instants: list[
             tuple[int, int, int, int]
         ] = []  # rows that had a multiplier, those of the last states last

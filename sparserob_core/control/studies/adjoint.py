@@ -26,7 +26,7 @@ from sparserob_core.sip.expressions.rounding import rounding
 
 STEP_NORM = 0.5  # norm times length of a step: what is left of the expansion is then 1e-14 of the row
 BENDING = 7  # terms of the bounds of derivatives; what is left of them is 1e-6 of the row's size in balanced units
-STORAGE_LIMIT = 2**27  # numbers that the rows of all steps take (1 GB)
+MAX_STORED_NUMBERS = 2**27  # numbers that the rows of all steps take (1 GB)
 MAX_ROW_NUMBERS = 2**22  # numbers of rows that are expanded at once (32 MB)
 TIME_BITS = 46  # a power of 1/2 of the horizon: a witness loses rounding by it, and 53 bits hold sums of such times
 BOUNDARY_ALLOWANCE = 1e-12  # of a set without axes, what corners and boundary points may be off: thousands of roundings
@@ -73,7 +73,7 @@ class Adjoint:
         balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
         speed = float(np.linalg.norm(balanced, 2)) * horizon
         count = 2 ** max(6, ceil(log2(max(speed, 1e-300) / STEP_NORM)))
-        if not count * A.shape[0] <= STORAGE_LIMIT:
+        if not count * A.shape[0] <= MAX_STORED_NUMBERS:
             raise NotEnclosable(
                 f"its fastest part moves {speed:.2g} times within the horizon, which takes too many steps"
             )

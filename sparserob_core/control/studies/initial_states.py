@@ -35,7 +35,7 @@ from sparserob_core.sip.program import (
 )
 from sparserob_core.sip.result import Result
 
-PROGRAMS_KEPT = 4  # ordinary programs, each at one initial state, that are remembered
+START_PROGRAMS_KEPT = 4  # ordinary programs, each at one initial state, that are remembered
 
 
 @final
@@ -78,7 +78,7 @@ class InitialPlane:
         if key not in self._programs:
             program = from_state(self.centred, self._build_initial_state(z)).program
             A, b = self._build_equalities(z)
-            remember(self._programs, key, replace(program, A=A, b=b), PROGRAMS_KEPT)
+            remember(self._programs, key, replace(program, A=A, b=b), START_PROGRAMS_KEPT)
         return self._programs[key]
 
     def rounded(self, z: Array, result: Result) -> Result:

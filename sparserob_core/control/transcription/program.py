@@ -42,7 +42,7 @@ from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, EqualityErro
 
 DIFFERENCE_ROUNDING = 1e-11  # of the numbers that are added up, a difference that is rounding
 EQUALS = "equals"  # the name of the fixed final states
-NEGLIGIBLE_ENTRY = 1e-15  # of the numbers that are added up, an entry of a row that is rounding
+NEGLIGIBLE_ROW_ENTRY = 1e-15  # of the numbers that are added up, an entry of a row that is rounding
 
 
 @final
@@ -208,7 +208,7 @@ def held_units(posed: Posed, ranged: ConvexSet) -> RowUnits:
     sums = added_up(replace(posed.held, control=ranged), posed.functionals)
     is_controlled = (
         np.abs(_build_equalities(posed.held, posed.functionals, posed.parameters)[0]).max(axis=1, initial=0.0)
-        > NEGLIGIBLE_ENTRY * sums
+        > NEGLIGIBLE_ROW_ENTRY * sums
     )
     H, h = slanted(ranged)
     sides = units_of_sides(H, h, ranged.reach(H), np.abs(H) @ extent(ranged)) if h.size else h

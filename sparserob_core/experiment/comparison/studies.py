@@ -18,7 +18,7 @@ from sparserob_core.experiment.config.plain import IRRELEVANT, value_text
 from sparserob_core.experiment.sweep.plan import FILE
 from sparserob_core.experiment.sweep.study import RUNS, read_study
 
-PROFILE_ACCURACY = 0.01
+PROFILE_ACCURACY = 0.01  # of the best value: a run is counted as solved from there on, unless stated otherwise
 BOUND_CONTRADICTION = 1e-7
 """By how much a proven bound may exceed another run's before one of them is called wrong, relative to the larger of 1
 and its size."""

@@ -25,7 +25,7 @@ from sparserob_core.sip.working.unbounded import complete_multipliers
 if TYPE_CHECKING:
     from sparserob_core.control.studies.causal import CausalBound
 
-FORMAT = 1
+FORMAT = 1  # the version of `certificate.json`, by which older ones are read
 MANY_CELLS = 1000  # number of cells from which neighbours that are whole pieces are written as one
 INWARD_FACTOR = 1.0 - 1e-13  # factor by which points of a curved set are moved inwards, against rounding errors
 WELL = 1e-14  # distance from the boundary at which a point need not be moved, relative to that from the middle

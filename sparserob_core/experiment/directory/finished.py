@@ -36,7 +36,7 @@ NUMBERS = ("cost", "value", "epsilon", "lower_bound", "upper_bound", "gap", "sec
 ANSWERS = ("gains", "observer", "prestabilise")
 # Difference that is allowed between dependent arrays, as a share of the largest number of the array
 ARRAY_TOLERANCE = 1e-9
-MAX_TEXT = 2**27
+MAX_JSON_BYTES = 2**27
 """Largest number of bytes of a JSON file. The largest that runs write have some 10 million; with ten times the limit a
 file could take all memory of a machine."""
 MAX_ENTRIES, MAX_LISTS = 2**23, 2**21
@@ -374,8 +374,8 @@ def read_json(file: Path) -> dict[str, Any]:
 def _read_json(file: Path) -> tuple[object, bool]:
     """Return the data of a JSON file, and whether any of its numbers may be infinite or NaN."""
     size, suspects = file.stat().st_size, list[str]()
-    if size > MAX_TEXT:
-        raise InputError(f"{file}: cannot be read: expected at most {MAX_TEXT} bytes, got {size}")
+    if size > MAX_JSON_BYTES:
+        raise InputError(f"{file}: cannot be read: expected at most {MAX_JSON_BYTES} bytes, got {size}")
     text = file.read_text(encoding="utf-8")
     for kind, count, limit in (
         ("entries", text.count(","), MAX_ENTRIES),

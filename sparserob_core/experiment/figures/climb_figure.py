@@ -22,7 +22,6 @@ NOTES = 3  # of the maximiser, at most, each in a panel of its own
 MEAN = 50  # evaluations over which the share of accepted ones is taken
 MIN_LABELLED_SHARE = 0.11  # share of the evaluations from which on a stage has room for words
 NEAREST_TO_HIGHEST = 1e-10  # of the highest value: what is nearer to it is drawn there
-VIEW_BELOW_OPTIMUM = 1.5  # the view of the bound reaches down by this many times the size of the optimum
 MAX_VECTOR_DOTS = 3000  # dots beyond which a figure for print holds them as a picture
 FIRST = ("temperature", "accepted", "scale", "depth", "constant")
 
@@ -202,7 +201,7 @@ def _draw_bound(ax: Axes, trace: SearchTrace, upper: float, exact: bool, unit: s
         return
     top = float(max(upper if np.isfinite(upper) else -np.inf, trace.bound[is_known].max()))
     low = (
-        max(float(trace.bound[is_known].min()), top - VIEW_BELOW_OPTIMUM * abs(top))
+        max(float(trace.bound[is_known].min()), top - look.VIEW_BELOW_OPTIMUM * abs(top))
         if top
         else float(trace.bound[is_known].min())
     )

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
 FLAT_VALUE_SHARE = 1e-9  # of the value: what varies by less does not vary
-MAX_POINTS = 2000  # visited points that are drawn
+MAX_DRAWN_POINTS = 2000  # visited points that are drawn
 
 
 @final
@@ -126,7 +126,7 @@ def _draw_map(figure: Figure, ax: Axes, data: LandscapeData) -> None:
                 markeredgewidth=0.3,
                 zorder=3,
                 label=label,
-                rasterized=few.size > MAX_POINTS // 4,
+                rasterized=few.size > MAX_DRAWN_POINTS // 4,
             )
     if accepted_places.size:
         path = data.visited[accepted_places]
@@ -173,9 +173,9 @@ def _draw_curve(ax: Axes, data: LandscapeData) -> None:
 
 
 def _thin_out(places: np.ndarray) -> np.ndarray:
-    """Return at most `MAX_POINTS` of the places, evenly chosen, with the first and the last among them."""
+    """Return at most `MAX_DRAWN_POINTS` of the places, evenly chosen, with the first and the last among them."""
     return (
-        places[np.unique(np.linspace(0, places.size - 1, MAX_POINTS).astype(int))]
-        if places.size > MAX_POINTS
+        places[np.unique(np.linspace(0, places.size - 1, MAX_DRAWN_POINTS).astype(int))]
+        if places.size > MAX_DRAWN_POINTS
         else places
     )

@@ -28,7 +28,7 @@ MAX_GAINS = 16  # pictures of gains in one figure
 # Half the least height of a switching function, in prices: at 15 the band is a line, at 1 it hides its edge
 MIN_SWITCHING_HEIGHT = 1.5
 HEADROOM = 1.15  # of the largest value, above it: at 1 it is on the frame, at 10 the band is a line
-NEGLIGIBLE_CONTROL = 1e-7  # of the control's bound: less than that is no action but rounding
+IDLE_SHARE_OF_BOUND = 1e-7  # of the control's bound: less than that is no action but rounding
 
 
 def run_pictures(data: FigureData) -> dict[str, Callable[[], Figure]]:
@@ -89,7 +89,7 @@ def draw_switching(data: FigureData) -> Figure:
         reach = max(MIN_SWITCHING_HEIGHT, HEADROOM * float(np.abs(values).max()))
         bound = max(abs(float(data.control_lower[channel])), abs(float(data.control_upper[channel])))
         size = np.abs(data.control[channel])
-        acts = size > NEGLIGIBLE_CONTROL * (bound if np.isfinite(bound) else float(size.max()))
+        acts = size > IDLE_SHARE_OF_BOUND * (bound if np.isfinite(bound) else float(size.max()))
         ax.stairs(np.where(acts, 2 * reach, 0.0) - reach, ends, baseline=-reach, fill=True, color=look.SKY, alpha=0.35,
                   linewidth=0, zorder=0, label="acts")  # fmt: skip
         ax.axhspan(-1.0, 1.0, color=look.MIST, alpha=0.6, linewidth=0, zorder=0.5, label="not worth its price")
@@ -242,7 +242,7 @@ def draw_effort(data: FigureData) -> Figure:
     ends, lengths = data.breakpoints, np.diff(data.breakpoints)
     largest = np.maximum(np.abs(data.control_least), np.abs(data.control_most))
     bound = np.maximum(np.abs(data.control_lower), np.abs(data.control_upper))
-    acts = largest > NEGLIGIBLE_CONTROL * np.where(np.isfinite(bound), bound, largest.max(axis=1))[:, None]
+    acts = largest > IDLE_SHARE_OF_BOUND * np.where(np.isfinite(bound), bound, largest.max(axis=1))[:, None]
     for channel, ax in enumerate(axes):
         low, middle, high = data.effort[:, channel]
         top = max(float(largest[channel].max()), 1e-9) * 1.12

@@ -31,6 +31,10 @@ EXCLUDED: dict[str, Any] = {"facecolor": MIST, "edgecolor": "#C4C4C4", "hatch": 
 FIGURE_WIDTH = 6.2
 """Width of every figure in inches: a text column at full size."""
 
+VIEW_BELOW_OPTIMUM = 1.5
+"""The view of a bound reaches down by this many times the size of the optimum; first bounds of a search may be far
+below."""
+
 LETTERS, MARKER_LETTERS = 104, 8
 """Letters that have room beside each other in a legend, and as how many of them a mark with its spaces is as wide: with
 more, or with narrower marks, the first and the last entry are cut off."""

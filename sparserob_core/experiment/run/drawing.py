@@ -47,7 +47,7 @@ Group: TypeAlias = Callable[[], Mapping[str, Picture]]
 
 logger = logging.getLogger("sparserob")
 
-LANDSCAPE_SECONDS = 2.0
+LANDSCAPE_VALUE_SECONDS = 2.0
 """Seconds for the values of a landscape, after those of its coarsest grid, and for the tuples of the search that are
 evaluated once more. With a tenth of it the figure is coarse, and the trajectory of the search begins in its middle. Ten
 times as many seconds are more than a user waits for."""
@@ -301,7 +301,7 @@ def landscape_of(
 
     Notes
     -----
-    The grid is refined until `LANDSCAPE_SECONDS` are over; the finest complete grid is returned.
+    The grid is refined until `LANDSCAPE_VALUE_SECONDS` are over; the finest complete grid is returned.
     """
     evaluations = np.flatnonzero(trace.epsilon == trace.epsilon[-1]) if trace.epsilon.size else np.empty(0, dtype=int)
     evaluations = evaluations[np.isfinite(trace.value[evaluations])]
@@ -351,7 +351,10 @@ def landscape_of(
     coordinates, (across, up, values) = list(g.coordinates), landscape.shown
     widths = (g.slot.upper - g.slot.lower)[coordinates]
     slots = deciding_slots(
-        deciding_again(g, trace.points[evaluations], notes, LANDSCAPE_SECONDS), tuples[:, :, coordinates], widths, pair
+        deciding_again(g, trace.points[evaluations], notes, LANDSCAPE_VALUE_SECONDS),
+        tuples[:, :, coordinates],
+        widths,
+        pair,
     )
     places = tuples[:, :, coordinates][np.arange(evaluations.size)[:, np.newaxis], slots]
     visited = axes.of(tuple(coordinates), places)
@@ -378,7 +381,7 @@ def _fill_landscape(landscape: Landscape, notify: Notify) -> None:
         if complete:
             size = " x ".join(str(axis.size) for axis in landscape.shown[:2])
             notify(StudyProgress(text=f"figures: the landscape of g on {size}"))
-        if landscape.level and time.monotonic() - start > LANDSCAPE_SECONDS:
+        if landscape.level and time.monotonic() - start > LANDSCAPE_VALUE_SECONDS:
             return
 
 

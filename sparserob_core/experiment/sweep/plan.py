@@ -22,7 +22,7 @@ from sparserob_core.experiment.config.reading.overrides import parse_overrides
 from sparserob_core.experiment.config.reading.reader import ConfigSource, read_source, read_value, write_yaml
 from sparserob_core.experiment.plugins.messages import nearest, shown
 from sparserob_core.experiment.run.events import StudyProgress
-from sparserob_core.experiment.sweep.axes import FIXED, MAX_POINTS, Axis, parse_axes, require_whole
+from sparserob_core.experiment.sweep.axes import FIXED, MAX_STUDY_POINTS, Axis, parse_axes, require_whole
 from sparserob_core.sip.events import Notify, ignore
 
 FILE = "sweep.yaml"
@@ -116,7 +116,7 @@ class Plan:
                 counts_text = ", ".join(f"{count} of {key}" for key, count in counts.items())
                 raise InputError(path="zip", expected="axes with equally many values", got=counts_text)
             return list(zip(*(axis.values for axis in self.axes), strict=True)) if self.axes else [()]
-        places = list(product(*(range(len(axis.values)) for axis in self._list_leading_axes(MAX_POINTS))))
+        places = list(product(*(range(len(axis.values)) for axis in self._list_leading_axes(MAX_STUDY_POINTS))))
         return [self._get_values(row) for row in places]
 
     def _list_leading_axes(self, max_points: float = np.inf) -> list[Axis]:
@@ -125,7 +125,7 @@ class Plan:
         leading = [axis for axis in self.axes if not axis.follows]
         count = int(np.prod([len(axis.values) for axis in leading], dtype=float))
         if count > max_points:
-            raise InputError(path="axes", expected=f"at most {MAX_POINTS} points", got=str(count))
+            raise InputError(path="axes", expected=f"at most {MAX_STUDY_POINTS} points", got=str(count))
         return leading
 
     def _get_values(self, places: Sequence[int]) -> tuple[Any, ...]:

@@ -45,7 +45,7 @@ from sparserob_core.sip.method import ExecutorFactory
 PAUSE = 0.5  # seconds between two reports of the points that run
 SECONDS_PER_TABLE = 2.0  # seconds between two versions of the table
 STILLBORN = 3  # number of consecutive executors whose workers may die before they begin a point
-MAX_NAME_LETTERS = 60  # letters of the name of a run directory, before its hash
+MAX_RUN_NAME_LETTERS = 60  # letters of the name of a run directory, before its hash
 HASH_DIGITS = 12  # digits of the hash in that name
 PARTIAL = ".partial"
 PARTIAL_OWNER = re.compile(rf"-[0-9a-f]{{{HASH_DIGITS}}}\.(.*)\.(\d+){re.escape(PARTIAL)}")
@@ -580,7 +580,7 @@ def run_name(axes: Sequence[Axis], point: Point) -> str:
         steps = [str(step) for step in axis.path if step != "name"]
         settings.append(f"{steps[-1] if steps else axis.key}={value_text(value)}")
     text = re.sub(r"[^A-Za-z0-9=.,+_-]+", "-", re.sub(r"[][(){}]|(?<=,)\s", "", "_".join(settings)))
-    return f"{text[:MAX_NAME_LETTERS].strip('-.,') or 'point'}-{point.hash[:HASH_DIGITS]}"
+    return f"{text[:MAX_RUN_NAME_LETTERS].strip('-.,') or 'point'}-{point.hash[:HASH_DIGITS]}"
 
 
 @contextmanager

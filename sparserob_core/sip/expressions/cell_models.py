@@ -29,7 +29,7 @@ TANGENT_RADII = np.pi / 4 * (1.0 + 0.05 * np.arange(19))  # circles for Cauchy's
 # Of a Bernstein form: rounding of sums of some hundred products and of halvings, which it exceeds
 BERNSTEIN_ROUNDING = 1e-13
 CELL_HALVINGS = 24  # of a cell for its polynomial: with half of them a peak is cut into cells that are expanded anew
-MAX_BOXES = 20_000  # of all polynomials: ten times as many take as long as to expand cells anew
+MAX_POLYNOMIAL_BOXES = 20_000  # of all polynomials: ten times as many take as long as to expand cells anew
 
 
 @final
@@ -393,7 +393,7 @@ def bound_polynomials(space: TaylorSpace, coefficients: Array, errors: Array, li
         for axis in range(1, nu + 1):
             corners = np.take(corners, [0, -1], axis=axis)
         is_attained = corners.reshape(owner.size, -1).max(axis=1) + slack[owner] > limit
-        is_last = step == CELL_HALVINGS or owner.size > MAX_BOXES
+        is_last = step == CELL_HALVINGS or owner.size > MAX_POLYNOMIAL_BOXES
         given_up = np.unique(owner[is_attained | (upper > limit) & is_last])
         is_closed = (upper <= limit) | np.isin(owner, given_up)
         np.maximum.at(bounds, owner[is_closed], upper[is_closed])

@@ -22,7 +22,7 @@ from sparserob_core.sip.inner.image import Memory
 # Of the least eigenvalue that is estimated, what is tried to be proven. With all of it rounding decides; a hundredth of
 # it is as good, for what residual slopes cost is mostly far below the tolerated gap.
 PROVEN = 0.5
-UNIT_ROUNDOFF = 2.0**-52
+MACHINE_EPSILON = 2.0**-52  # the distance of 1 to the next double
 # Entries up to which a matrix is looked at. Ten times as many take minutes, a tenth leaves fits of a hundred terms out.
 MAX_MATRIX_ENTRIES = 600
 REFINEMENTS = 4  # each gains four digits at a condition of 1e12; a fifth is lost in rounding
@@ -51,12 +51,12 @@ def least_curvature(P: Array) -> Array | None:
         factor = np.linalg.cholesky(scaled - share * np.eye(n))
     except np.linalg.LinAlgError:
         return None
-    error = 2.0 * (n + 2) * UNIT_ROUNDOFF * float(scaled.trace())
+    error = 2.0 * (n + 2) * MACHINE_EPSILON * float(scaled.trace())
     if not share > error:
         error = _bound_factor_error(scaled, share, factor)
     if not share > error:
         return None
-    return np.asarray((share - error) / unit**2 * (1.0 - 4.0 * UNIT_ROUNDOFF), dtype=float)
+    return np.asarray((share - error) / unit**2 * (1.0 - 4.0 * MACHINE_EPSILON), dtype=float)
 
 
 def _bound_factor_error(scaled: Array, share: float, factor: np.ndarray) -> float:

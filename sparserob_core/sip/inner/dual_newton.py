@@ -23,15 +23,15 @@ from sparserob_core.sip.inner.change_of_variables import in_new_variables
 from sparserob_core.sip.inner.duality import bent_minimisers, measure
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 
-NEWTON_ITERATIONS = 60
-IDLE_STEPS = 10
-SEARCH = 25
-TARGET = 1e-12
+NEWTON_ITERATIONS = 60  # at most, before the program is left to another solver
+IDLE_STEPS = 10  # without a smaller error, after which the method gives up
+LINE_SEARCH_STEPS = 25  # at most, in either direction: lengths are multiplied by four, so that 25 reach any size
+RESIDUAL_TARGET = 1e-12  # of the decision: a residual at which the method ends, some roundings of a product
 TINY = float(np.finfo(float).tiny)
 DAMPING, DAMPED = 1e-13, 1e4  # of the trace of a Hessian, and what that becomes where a step climbs nothing
 # below this, relative to the linear cost, the curvature amplifies round-off too much for Newton's method alone
 MIN_CURVATURE_SHARE = 1e-4
-SAME_POINT_DISTANCE = 1e-9  # a proximal point that moves by less, relative to the decision, has arrived
+ARRIVAL_DISTANCE = 1e-9  # a proximal point that moves by less, relative to the decision, has arrived
 HEAVIEST, LIGHTEST = 1e6, 1e-9  # weights of a proximal point, of the largest coefficient of the cost
 LIGHTER, HEAVIER = 0.1, 30.0  # what a weight becomes after a proximal point that was found, and one that was not
 NOT_SEPARABLE = "its quadratic cost couples variables: a separable program is needed"
@@ -168,7 +168,7 @@ def proximal_polish(
             break
         if (
             not is_flat
-            and distance <= SAME_POINT_DISTANCE * (1.0 + float(np.abs(x).max(initial=0.0)))
+            and distance <= ARRIVAL_DISTANCE * (1.0 + float(np.abs(x).max(initial=0.0)))
             and weight <= 2 * curvature.min()
         ):
             break
@@ -312,7 +312,7 @@ def _ascend(dual: _Dual, point: _Point, steps: int, patience: int) -> _Point | N
     error = least = dual.error(point)
     stalled, damping = 0, DAMPING
     for _ in range(steps):
-        if error <= TARGET * scale:
+        if error <= RESIDUAL_TARGET * scale:
             return point
         if not np.isfinite(error) or stalled > patience:
             return None
@@ -377,7 +377,7 @@ def _search_line(dual: _Dual, point: _Point, step: Float[Array, " v"]) -> float:
     falling = dual.signed & (step < 0)
     furthest = max(1.0, float((point.dual[falling] / -step[falling]).min(initial=np.inf)))
     low, rising, high = 0.0, first, 1.0
-    for _ in range(SEARCH):
+    for _ in range(LINE_SEARCH_STEPS):
         derivative = float(change @ dual.decision(slope + high * change)) - constant
         if derivative <= 0.1 * first:
             break
@@ -387,7 +387,7 @@ def _search_line(dual: _Dual, point: _Point, step: Float[Array, " v"]) -> float:
     if derivative > 0:
         return high
     length, sinking = high, derivative
-    for _ in range(SEARCH):
+    for _ in range(LINE_SEARCH_STEPS):
         if abs(derivative) <= 0.1 * first:
             return length
         if derivative > 0:

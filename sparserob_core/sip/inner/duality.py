@@ -34,7 +34,7 @@ SPARE_ROUNDINGS = 16  # roundings beside those of long sums: of products with a 
 MORE_DIGITS_ERROR = 1e-11  # of a bound: where its evaluation may be off by more, it is evaluated with more digits
 SLOPE_LIMIT_DISTANCE = 1e-6  # a slope this close to its limit, or beyond it, is moved onto the limit
 INFINITE_BOUND = 1e300  # an infinite bound of one block is compared as minus this number
-REPAIRS = 4
+MAX_REPAIRS = 4  # corrections of multipliers of the wrong sign; what is not right by then is no better bound
 FREE = 1e-7  # an entry further than this from 0 and from both bounds, relative to their distance, is free
 ACTIVE_ROW_SLACK = 1e-9  # a row with a slack below this may carry a multiplier
 ACTIVE = 1e-9  # a row with a multiplier above this, relative to the largest, is active
@@ -400,7 +400,7 @@ def repaired(
     Only positive ``y``, ``mu``, the point ``at`` of the tangent to ``P``, and the ``z`` of bounded images are moved.
     """
     better: Multipliers | None = (y, mu, z, at)
-    for _ in range(REPAIRS):
+    for _ in range(MAX_REPAIRS):
         if better is None or not all(np.isfinite(v).all() for v in better if v is not None):
             return None
         better = _correct_multipliers(program, *better)

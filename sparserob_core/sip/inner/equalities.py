@@ -9,12 +9,12 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.inner.image import within_bounds
 
-CORRECTION_STEPS = 3
+CORRECTION_STEPS = 3  # of least squares, at most, each with the residual of the last one
 SUM_ROUNDING = 2.0**-52  # of the numbers that are added up, what is left to rounding
 # Of the numbers that are added up: what misses an equality by more is no answer that rounding spoilt
 SPOILT_RESIDUAL = 1e-6
 SAME_BOUND_SHARE = 1e-13  # of a bound, a distance from it that is none
-RANK_TOLERANCE = 1e-12
+RANK_TOLERANCE = 1e-12  # of the largest singular value: a row below depends on others
 
 
 @shaped

@@ -13,6 +13,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram
 
 WIDE = np.longdouble
+# Of a slope: one that is so near its weight decides nothing, so that either side of its entry is evaluated.
 SLOPE_ALLOWANCE = 1e-9
 UNIT = float(np.finfo(WIDE).eps)  # at least twice the unit roundoff, whatever the machine calls extended
 

@@ -41,7 +41,7 @@ class Memory:
         return result
 
 
-HOLDS = 5
+MAX_PROJECTIONS = 5  # of the multipliers of an image, at most
 CANCELLED_SHARE = 1e-13  # of what is added up: what may be left where more cannot be had
 # Of the same: what is left by rounding alone, and not worth a projection. With ten times as much a bound is above what
 # its multipliers prove by more than what is taken off it; with a tenth of it every exact answer is projected.
@@ -63,7 +63,7 @@ def onto_stationary(program: FiniteProgram, z: Float[Array, " k"], slope: Float[
     unbounded_above, unbounded_below = np.isposinf(program.upper), np.isneginf(program.lower)
     is_held = (program.weights == 0) & unbounded_below & unbounded_above
     projected = z
-    for number in range(HOLDS):
+    for number in range(MAX_PROJECTIONS):
         if number or not _is_stationary(S, projected, slope, STATIONARY_ROUNDING):
             z = np.where(is_held, np.clip(z, -program.weights, program.weights), z)
             project = _factors.recall((S,), is_held.tobytes(), partial(_factor_projection, S, ~is_held))

@@ -15,9 +15,9 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 
-REFINEMENT_STEPS = 4
+REFINEMENT_STEPS = 4  # at most, each with the residual of the last one
 GROWTH = 2.0**20  # by which a step blows up more than the last one, at most
-LARGEST_SCALE = 2.0**60
+LARGEST_SCALE = 2.0**60  # by which a residual is enlarged: a smaller one is rounding
 ABSENT_BOUND = 2.0**30  # a bound at this distance is none
 PROHIBITIVE_COST = 2.0**30  # a variable that costs this much stays at its bound
 DEPENDENT_ROW_SHARE = 1e-13  # of the largest entry: what is left of a row that depends on others

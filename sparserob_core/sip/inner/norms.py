@@ -15,7 +15,7 @@ from sparserob_core.sip.inner.image import onto_stationary
 
 FAN = 8  # directions of a block of two entries, to begin with
 MAX_CUBE_ENTRIES = 4  # entries of a block up to which the corners of a cube are looked at too
-DIRECTIONS_KEPT = 6  # directions of a block, those nearest to what an answer asks for, that are worth keeping
+BLOCK_DIRECTIONS_KEPT = 6  # directions of a block, those nearest to what an answer asks for, that are worth keeping
 NEGLIGIBLE_NORM = 1e-14  # of the largest norm: a block that has no direction
 
 
@@ -62,14 +62,14 @@ def towards(
 
 
 def near(directions: Directions, wanted: Directions) -> Directions:
-    """Return, for every block, the at most `DIRECTIONS_KEPT` directions that are nearest to one of its ``wanted``
+    """Return, for every block, the at most `BLOCK_DIRECTIONS_KEPT` directions that are nearest to one of its ``wanted``
     directions."""
     kept = []
     for block in np.unique(wanted.block):
         candidates = np.flatnonzero(directions.block == block)
         targets = wanted.vectors[wanted.block == block]
         cosines = (directions.vectors[candidates] @ targets.T).max(axis=1, initial=-1.0)
-        kept.append(candidates[np.argsort(-cosines, kind="stable")[:DIRECTIONS_KEPT]])
+        kept.append(candidates[np.argsort(-cosines, kind="stable")[:BLOCK_DIRECTIONS_KEPT]])
     chosen = np.concatenate([np.zeros(0, dtype=int), *kept])
     return Directions(directions.block[chosen], directions.vectors[chosen])
 

@@ -18,7 +18,7 @@ from sparserob_core.sip.finite import FiniteProgram
 SIMPLEX_ACCURACY = 1e-10  # the finest that the simplex method offers
 SIFTED_ENTRIES = 5000  # entries of a separable program from which most are left out of the simplex method
 NEAREST = 1000  # of them, those that it begins with; or a share of them
-NEAREST_SHARE = 0.05
+NEAREST_SHARE = 0.05  # of the entries: those that the simplex method begins with, where that is more
 UNSOLVED: dict[int, Literal["infeasible", "unbounded"]] = {2: "infeasible", 3: "unbounded"}  # scipy's numbers
 
 

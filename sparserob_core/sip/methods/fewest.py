@@ -20,7 +20,7 @@ from sparserob_core.sip.working.counting import DUST, count, counted_below, pric
 from sparserob_core.sip.working.ledger import Violated
 
 TOLERANCE, ROUNDS = 1e-6, 40  # of the bound, which is told in whole pieces or with six digits
-PROPORTIONAL = 1e-12
+PROPORTIONAL = 1e-12  # relative difference of shares that are equal up to rounding
 
 
 def multiple(program: SemiInfiniteProgram) -> float | None:

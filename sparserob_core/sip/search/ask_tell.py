@@ -30,7 +30,7 @@ from sparserob_core.sip.search.ranges import Ranges
 Search: TypeAlias = Callable[[Callable[[Array], Array]], Report]
 Key: TypeAlias = tuple[float, ...]
 
-FORMAT = 1
+FORMAT = 1  # the version of `state`, by which older ones are read
 WORDS = {np.inf: "inf", -np.inf: "-inf"}
 # Seconds that a maximiser may take to end; in many coordinates one of its steps may take a tenth or more
 SEARCH_GRACE_SECONDS = 5.0

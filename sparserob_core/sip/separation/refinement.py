@@ -16,7 +16,7 @@ Rows: TypeAlias = npt.NDArray[Any]
 Truths: TypeAlias = npt.NDArray[np.bool_]
 VectorFunction: TypeAlias = Callable[[Array], Array]
 
-MAX_CLIMB_STEPS = 80
+MAX_REFINEMENT_STEPS = 80  # of a climb to a maximum
 MAX_STEP_RADII = 2.0
 """Longest step, in radii and per coordinate."""
 FARTHER = 2.0
@@ -92,7 +92,7 @@ def refine(function: VectorFunction, candidates: Candidates, least: float = -np.
     curvature = np.full((count, dimension), np.nan)
     active = np.arange(count)
     points, values, radius = candidates.points.copy(), candidates.values.copy(), candidates.radius.copy()
-    for _ in range(MAX_CLIMB_STEPS):
+    for _ in range(MAX_REFINEMENT_STEPS):
         now = Candidates(points[active], candidates.rows[active], values[active], radius[active])
         better, curved, is_done = _take_step(function, now, offsets, curvature[active], least)
         points[active], values[active], radius[active], curvature[active] = (

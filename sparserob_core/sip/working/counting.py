@@ -291,11 +291,11 @@ def met(program: SemiInfiniteProgram, x: Array, G: Array, h: Array) -> Array:
     columns, decision = np.vstack([base.A, G, kept_rows])[:, is_free], x.copy()
     sizes = np.linalg.norm(columns, axis=1)
     sizes = np.where(sizes > 0.0, sizes, 1.0)[:, None]
-    for _ in range(REFINED):
+    for _ in range(REFINEMENT_ROUNDS):
         residuals = np.concatenate([base.excess(decision), G @ decision - h, kept_rows @ (decision - x)])
         decision[is_free] -= np.linalg.lstsq(columns / sizes, residuals / sizes[:, 0], rcond=None)[0]
     return decision
 
 
-REFINED = 3
+REFINEMENT_ROUNDS = 3  # of the least squares that meet active rows: the second one corrects the rounding of the first
 MAX_IMAGE_VARIABLES = 2000  # largest number of variables for which images are solved

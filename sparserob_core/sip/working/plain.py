@@ -35,7 +35,7 @@ from sparserob_core.sip.working.working import LargestViolation, Working, fits
 
 # Number of rounds without a multiplier after which a row is dropped. With 1, rows are dropped and imposed in turn; with
 # ten times as many, solving takes longer the more rounds there were.
-IDLE_ROUNDS = 3
+ROUNDS_WITHOUT_MULTIPLIER = 3
 # Number of rounds after which rows are only added, so that nothing can cycle. With a tenth, curved constraints keep
 # more rows than they need; ten times as many are more rounds than any run has.
 DROPPING_ROUNDS = 40
@@ -212,7 +212,7 @@ class PlainRows(Working):
         multipliers, zeros = answer.multipliers, np.zeros(fresh.h.size)
         y = np.concatenate([multipliers, np.zeros(self.rows.h.size - multipliers.size)])  # zeros for rows imposed since
         idle = np.where(y > 0.0, 0, self.idle + 1)
-        keep = (idle < IDLE_ROUNDS) | (number > DROPPING_ROUNDS) | (not self.sheds)
+        keep = (idle < ROUNDS_WITHOUT_MULTIPLIER) | (number > DROPPING_ROUNDS) | (not self.sheds)
         self.rows = self.rows.take(keep).joined(fresh)
         self.idle = np.concatenate([idle[keep], zeros.astype(int)])
         fixed = answer.solution.y[: answer.solution.y.size - multipliers.size]

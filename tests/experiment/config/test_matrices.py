@@ -182,7 +182,7 @@ def test_a_file_that_pretends_to_hold_much_is_refused_unread(tmp_path: Path, mon
 
 
 def test_matrices_that_no_directory_could_hold_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "MAX_TEXT", 10)
+    monkeypatch.setattr(files, "MAX_PACKED_LETTERS", 10)
     with pytest.raises(sr.ConfigError, match="at most 10 characters"):
         load_config(beside(tmp_path / "given", **good()))
 

@@ -45,7 +45,7 @@ def searched(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """No time but for the coarsest landscape."""
-    monkeypatch.setattr(drawing, "LANDSCAPE_SECONDS", 0.0)
+    monkeypatch.setattr(drawing, "LANDSCAPE_VALUE_SECONDS", 0.0)
 
 
 @pytest.mark.slow

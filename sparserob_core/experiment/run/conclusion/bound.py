@@ -21,7 +21,7 @@ from sparserob_core.sip.result import Result
 
 BOUND_SECONDS = 10.0  # for a bound in ball arithmetic, where another bound holds too; where none does there is no limit
 NO_TIME = "there was no time to see what the multipliers prove without rounding"
-COST_ROUNDING = 1e-12  # of a cost
+DERIVED_COST_ROUNDING = 1e-12  # of a cost
 CROSSED = (
     "the lower bound {:.12g} that its multipliers prove is above the cost {:.12g} of a decision that was proven, by"
     " more than the tolerances of the proofs allow: one of the two is wrong, and neither is claimed; {}"
@@ -115,7 +115,7 @@ def _compute_allowance(result: Result) -> float:
     `sip.working.ledger.alarm` has judged the bound before, in the program's own units.
     """
     units = {proof.family: proof.units for proof in result.proofs}
-    allowed = np.inf if result.dual.mu.size else COST_ROUNDING * abs(result.cost)
+    allowed = np.inf if result.dual.mu.size else DERIVED_COST_ROUNDING * abs(result.cost)
     for cut in result.dual.cuts:
         row_units = units.get(cut.family)
         allowed += np.inf if row_units is None else cut.multiplier * TOLERANCE * float(row_units[cut.row])
