@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-LINES = 10
+MAX_BRIEF_LINES = 10
 """Lines of a record at most. A hundred would push what was typed before off a terminal, one says nothing."""
 
-WIDTH = 100
+MAX_VALUE_LETTERS = 100
 """Letters of a value at most, a line of a terminal. With ten no path is recognised, with a thousand one value fills
 half of a terminal."""
 
@@ -21,19 +21,23 @@ would be told by its shape only."""
 
 
 def brief(record: Any) -> str:
-    """A dataclass in at most `LINES` lines, for its ``__repr__``: a line for every field that is shown, and the names
-    of those for which no line is left."""
+    """A dataclass in at most `MAX_BRIEF_LINES` lines, for its ``__repr__``: a line for every field that is shown, and
+    the names of those for which no line is left."""
     return _format_lines(type(record).__name__, _list_fields(record))
 
 
 def shortened(lines: Sequence[str]) -> str:
     """Lines for a prompt: long ones cut, and of many the first and how many more there are."""
-    kept = lines if len(lines) <= LINES else [*lines[: LINES - 1], f"  and {len(lines) - LINES + 1} more"]
+    kept = (
+        lines
+        if len(lines) <= MAX_BRIEF_LINES
+        else [*lines[: MAX_BRIEF_LINES - 1], f"  and {len(lines) - MAX_BRIEF_LINES + 1} more"]
+    )
     return "\n".join(f"{line[: len(line) - len(line.lstrip())]}{_shorten(line)}" for line in kept)
 
 
 def _format_lines(heading: str, shown: Sequence[tuple[str, object]]) -> str:
-    room = len(shown) if len(shown) < LINES else LINES - 2
+    room = len(shown) if len(shown) < MAX_BRIEF_LINES else MAX_BRIEF_LINES - 2
     lines = [heading, *(f"  {name}: {_format_value(value)}" for name, value in shown[:room])]
     if shown[room:]:
         lines.append("  " + _shorten(f"and {', '.join(name for name, _ in shown[room:])}"))
@@ -54,18 +58,18 @@ def _is_empty(value: object) -> bool:
 
 
 def noun(record: Any) -> str:
-    """A dataclass of what a problem is made of, for its ``__repr__``: one line where it fits into `WIDTH`, else as
-    `brief` says it. What was left out, ``None`` or nothing, is not said. A record may have a name and fields of its own
-    to be shown by, ``noun_of``."""
+    """A dataclass of what a problem is made of, for its ``__repr__``: one line where it fits into `MAX_VALUE_LETTERS`,
+    else as `brief` says it. What was left out, ``None`` or nothing, is not said. A record may have a name and fields of
+    its own to be shown by, ``noun_of``."""
     heading, shown = getattr(record, "noun_of", None) or (type(record).__name__, _list_fields(record))
     entries = _drop_empty(shown)
     line = f"{heading}({', '.join(f'{name}={_format_value(value)}' for name, value in entries)})"
-    return line if len(line) <= WIDTH else _format_lines(heading, entries)
+    return line if len(line) <= MAX_VALUE_LETTERS else _format_lines(heading, entries)
 
 
 def _format_value(value: object) -> str:
     if isinstance(value, np.ndarray):
-        numbers = np.array2string(value, precision=6, separator=", ", max_line_width=WIDTH)
+        numbers = np.array2string(value, precision=6, separator=", ", max_line_width=MAX_VALUE_LETTERS)
         return " ".join(numbers.split()) if value.size <= ENTRIES else f"array {value.shape}"
     if isinstance(value, float | np.floating):
         return f"{value:.9g}"
@@ -83,4 +87,4 @@ def _format_value(value: object) -> str:
 
 def _shorten(text: str) -> str:
     line = " ".join(text.split())
-    return line if len(line) <= WIDTH else f"{line[: WIDTH - 3]}..."
+    return line if len(line) <= MAX_VALUE_LETTERS else f"{line[: MAX_VALUE_LETTERS - 3]}..."

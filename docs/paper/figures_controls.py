@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def draw_controls(directory: Path, name: str, titles: Mapping[str, str], outcomes: Mapping[str, sr.Outcome]) -> None:
     """One panel per control on a common axis, with its cost and the share of time in which it acts."""
     with look.style():
-        figure, axes = columns(len(titles), 1, look.WIDTH - 0.6, 1.0)
+        figure, axes = columns(len(titles), 1, look.FIGURE_WIDTH - 0.6, 1.0)
         for ax, (study, title) in zip(axes[:, 0], titles.items(), strict=True):
             outcome = outcomes[study]
             steps(ax, outcome, outcome.control[0], "control")

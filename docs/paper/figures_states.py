@@ -113,7 +113,7 @@ def draw_ends(
     from matplotlib.patches import Polygon, Rectangle
 
     with look.style():
-        figure = Figure(figsize=(look.WIDTH, 3.5), layout="constrained")
+        figure = Figure(figsize=(look.FIGURE_WIDTH, 3.5), layout="constrained")
         axes = figure.subplots(1, len(titles), squeeze=False)
         for ax, (study, title) in zip(axes[0], titles.items(), strict=True):
             box = next(terminal for terminal in outcomes[study].problem.terminal if isinstance(terminal, sr.Box))

@@ -19,12 +19,13 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import Array as Array  # noqa: PLC0414  where the rest of the core takes it from
 from sparserob_core.shapes import Bool, Float, sealed, shaped
 
-HALVINGS = 60
+# After which an interval of doubles is as short as rounding; with half of them a root has nine digits.
+BISECTION_HALVINGS = 60
 RELATIVE = 1e-12  # accuracy of a gauge that is computed from the support function alone
 PIVOTS = 500  # largest number of support points computed for one boundary point
 # Opposite sides count as one where their distance is at most this share of the set's extent along the normal. With a
 # thousandth of it, gains of 1e12 are sought for deviations of 1e-12; with ten times as much, their effect is visible.
-CLOSED = 1e-9
+CLOSED_WIDTH_SHARE = 1e-9
 SPIKE = 1e-12  # of the set's extent: half the thickness below which a set counts as one without interior
 TILT = 1e-14  # angle by which a ray is turned in the choice of pivots, so that no choice is a tie
 PLAIN = 3  # dimension up to which a set is sampled by rejection
@@ -36,8 +37,8 @@ EDGE, INWARDS = 1e-13, 1e-12
 # Number of sides of a box up to which they are added one after the other, in the order of NumPy's own sum of so few
 # numbers. With ten times as many, sums are rounded in another order. With 1, sums of two or three numbers take thirty
 # times as long, and a proof in several dimensions takes millions of them.
-FEW = 7
-TRIES = 10_000  # points drawn per wanted point before rejection sampling gives up
+MAX_SIDES_ONE_BY_ONE = 7
+DRAWS_PER_POINT = 10_000  # points drawn per wanted point before rejection sampling gives up
 
 
 @shaped
@@ -45,7 +46,7 @@ def bisect(
     beyond: Callable[[Array], npt.NDArray[np.bool_]],
     low: Float[Array, " *k"],
     high: Float[Array, " *k"],
-    halvings: int = HALVINGS,
+    halvings: int = BISECTION_HALVINGS,
 ) -> tuple[Float[Array, " *k"], Float[Array, " *k"]]:
     """Return brackets of the points at which ``beyond`` changes from false to true, one for each entry.
 
@@ -161,7 +162,7 @@ class ConvexSet(ABC):
         if flat is None or not self.is_bounded:
             return axes
         H, radii = flat[0], self.width(axes) / 2.0
-        closed = self.width(H) <= CLOSED * (np.abs(H) @ radii)
+        closed = self.width(H) <= CLOSED_WIDTH_SHARE * (np.abs(H) @ radii)
         return null_space(H[closed]) if closed.any() else axes
 
     @property
@@ -417,7 +418,7 @@ class ConvexSet(ABC):
                 high, low = (1.0 / self._compute_gauge(points, sign * directions)[0] for sign in (1.0, -1.0))
             return -low, high
         slopes, distances = directions @ flat[0].T, np.maximum(flat[1] - points @ flat[0].T, 0.0)
-        slopes = np.where(np.abs(slopes) > CLOSED * (np.abs(directions) @ np.abs(flat[0]).T), slopes, 0.0)
+        slopes = np.where(np.abs(slopes) > CLOSED_WIDTH_SHARE * (np.abs(directions) @ np.abs(flat[0]).T), slopes, 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
             lengths = distances / slopes
         return (
@@ -547,7 +548,7 @@ class ConvexSet(ABC):
             points = rng.uniform(box.lower, box.upper, size=(max(64, count), self.dimension))
             accepted_points = np.vstack([accepted_points, points[self.contains(points, 0.0)]])
             drawn_count += points.shape[0]
-            if drawn_count > TRIES * (accepted_points.shape[0] + 1):
+            if drawn_count > DRAWS_PER_POINT * (accepted_points.shape[0] + 1):
                 return None
         return accepted_points[:count]
 
@@ -767,7 +768,7 @@ class Box(ConvexSet):
     @shaped
     def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         directions = np.asarray(directions, dtype=float)
-        if self.is_bounded and self.dimension <= FEW:  # side by side, in the order of NumPy's sum
+        if self.is_bounded and self.dimension <= MAX_SIDES_ONE_BY_ONE:  # side by side, in the order of NumPy's sum
             sides = [(directions[..., i], self.lower[i], self.upper[i]) for i in range(self.dimension)]
             if self._is_centred:
                 return np.asarray(sum(np.abs(side) * high for side, _, high in sides))

@@ -1,10 +1,10 @@
 """Convex quadratic forms: a check of each form from outside, before a bound rests on it, and regularisers.
 
 The check does not depend on the units of the variables. A matrix counts as positive semidefinite if a change of its
-diagonal by ``ROUNDED`` of itself, for every entry of the longest row, makes it so. Such a change exceeds the rounding
-error of ``L L'`` in any scaling (Higham 2002, section 10.1; Demmel 1989): an entry ``(i, j)`` of such a product is
-rounded by its share of ``sqrt(P_ii P_jj)``. A factorisation without pivoting that meets only positive pivots is the
-proof, except for its own rounding, which is of the same kind (Rump 2006).
+diagonal by ``ENTRY_ROUNDING`` of itself, for every entry of the longest row, makes it so. Such a change exceeds the
+rounding error of ``L L'`` in any scaling (Higham 2002, section 10.1; Demmel 1989): an entry ``(i, j)`` of such a
+product is rounded by its share of ``sqrt(P_ii P_jj)``. A factorisation without pivoting that meets only positive pivots
+is the proof, except for its own rounding, which is of the same kind (Rump 2006).
 """
 
 from __future__ import annotations
@@ -26,11 +26,12 @@ if TYPE_CHECKING:
 # Rounding allowed in every entry, relative to sqrt(P_ii P_jj): 13 digits. With a tenth of it, products of long matrices
 # are refused; with ten times as much, the error of a lower bound may reach a certified gap of 1e-9, for rows of a
 # thousand entries.
-ROUNDED = 1e-13
-DENSE = 400  # rows up to which a matrix is factored as a dense one, whatever its pattern; ten times more costs 1 s
+ENTRY_ROUNDING = 1e-13
+# Rows up to which a matrix is factored as a dense one, whatever its pattern; ten times more costs 1 s
+MAX_DENSE_ROWS = 400
 FULL = 0.1  # share of non-zero entries from which larger matrices are dense too: sparse factors would fill up
-SHOWN = 1000  # rows up to which a refusal computes all eigenvalues; ten times as many take minutes
-STEPS = 60  # steps of the Lanczos method by which a refusal estimates the least eigenvalue of larger matrices
+MAX_EIGENVALUE_ROWS = 1000  # rows up to which a refusal computes all eigenvalues; ten times as many take minutes
+LANCZOS_STEPS = 60  # steps of the Lanczos method by which a refusal estimates the least eigenvalue of larger matrices
 
 _convex_matrices: WeakValueDictionary[int, csc_array] = WeakValueDictionary()
 
@@ -196,7 +197,7 @@ def _find_negative_direction(P: csc_array) -> Array | None:
     kept = np.flatnonzero(diagonal > 0.0)
     P = P if kept.size == diagonal.size else P[kept][:, kept]
     size = 1.0 / np.sqrt(diagonal[kept])
-    shift = 1.0 + ROUNDED * int(np.diff(P.indptr).max(initial=1))
+    shift = 1.0 + ENTRY_ROUNDING * int(np.diff(P.indptr).max(initial=1))
     if (size * (abs(P) @ size) <= 1.0 + shift).all():  # every row is dominated by its diagonal (Gershgorin)
         return None
     kept_direction = _find_nonpositive_direction(P, shift)
@@ -232,7 +233,7 @@ def _find_nonpositive_direction(P: csc_array, factor: float) -> Array | None:
     ``None`` where elimination without pivoting meets only positive pivots.
     """
     n = P.shape[0]
-    if n <= DENSE or P.nnz >= FULL * n * n:
+    if n <= MAX_DENSE_ROWS or P.nnz >= FULL * n * n:
         return _find_nonpositive_direction_dense(P, factor)
     from scipy.sparse import csc_array, diags_array
     from scipy.sparse.linalg import splu, spsolve_triangular
@@ -289,7 +290,7 @@ def _symmetrise(path: str, P: csc_array) -> csc_array:
         return P
     difference = abs(P - transpose).tocoo()
     size = np.sqrt(np.abs(P.diagonal()))
-    allowed = ROUNDED * np.maximum(
+    allowed = ENTRY_ROUNDING * np.maximum(
         size[difference.row] * size[difference.col], np.abs(P[difference.row, difference.col])
     )
     excessive = np.flatnonzero(difference.data > allowed)
@@ -335,10 +336,10 @@ def _find_least_eigenvalue(P: csc_array, direction: Array) -> tuple[float, bool]
     For a large matrix, it is the least value of the form on unit vectors of a Krylov space (Lanczos) that starts from
     ``direction``.
     """
-    if P.shape[0] <= SHOWN:
+    if P.shape[0] <= MAX_EIGENVALUE_ROWS:
         return float(np.linalg.eigvalsh(P.toarray())[0]), True
     basis = (direction / np.linalg.norm(direction))[:, None]
-    for _ in range(STEPS):
+    for _ in range(LANCZOS_STEPS):
         fresh = P @ basis[:, -1]
         for _ in range(2):
             fresh = fresh - basis @ (basis.T @ fresh)

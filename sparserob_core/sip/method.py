@@ -22,7 +22,8 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.solver import Solver
 
-ROUNDING = 1e-12  # relative rounding error of a product of factors; weights that are meant to differ do so by far more
+# Relative rounding error of a product of factors; weights that are meant to differ do so by far more
+WEIGHT_ROUNDING = 1e-12
 GAP_TOLERANCE = 1e-7  # relative gap at which the gap counts as closed, unless a method has another one
 
 
@@ -75,7 +76,7 @@ class Continuation(Options):
         """
         weight: object = self.factor * epsilon if regu is None else regu(epsilon, j)
         if isinstance(weight, int | float | np.floating) and 0.0 < weight < epsilon:
-            return self.stop if weight <= self.stop * (1.0 + ROUNDING) else float(weight)
+            return self.stop if weight <= self.stop * (1.0 + WEIGHT_ROUNDING) else float(weight)
         raise InputError(f"regu: expected a positive weight below {epsilon!r}, got {weight!r}")
 
     @model_validator(mode="after")

@@ -33,7 +33,7 @@ index, the rest is; ``nominal``: nothing uncertain is part of it; ``literal``: a
 TOLERANCE = 1e-9  # of a row's own unit: a violation of at most this counts as none (docs/decisions/0016)
 OUTSIDE = 1e-9  # of the sides of an index set and its distance from 0: error by which rounding may put an index outside
 NARROW = 1e-12  # of the side of a box: a gap between two cells that is only rounding of their corners
-PARTS = 4_000_000  # largest number of parts of the grid between the corners of all cells: 32 MB
+MAX_GRID_PARTS = 4_000_000  # largest number of parts of the grid between the corners of all cells: 32 MB
 EXPRESSED = 0.01  # sharpness of expressions: with 1, excuses cost as much as a gap; a tenth of it is rounding
 EQUALITY = 1e-12  # of the numbers that are added up: an equality with at most this residual counts as met
 
@@ -669,7 +669,8 @@ def uncovered(lower: Array, upper: Array, box: Box) -> Array | None:
     """Return a point of the box that lies in none of the cells; ``None`` where the cells cover the box.
 
     The corners of all cells divide the box into a grid, and each part of the grid is inside a cell or outside of it. A
-    grid of more than `PARTS` parts is not made. Then the total volume of the cells is compared with that of the box.
+    grid of more than `MAX_GRID_PARTS` parts is not made. Then the total volume of the cells is compared with that of
+    the box.
 
     Parameters
     ----------
@@ -697,7 +698,7 @@ def uncovered(lower: Array, upper: Array, box: Box) -> Array | None:
         return None
     edges = [_merge_edges(np.concatenate([begins[:, i], ends[:, i], [0.0, 1.0]])) for i in range(free_axes.size)]
     middle = (box.lower + box.upper) / 2
-    if np.prod([float(axis_edges.size) for axis_edges in edges]) > PARTS:
+    if np.prod([float(axis_edges.size) for axis_edges in edges]) > MAX_GRID_PARTS:
         return middle if volumes.sum() < 1.0 - OUTSIDE else None
     places = [
         [np.searchsorted(edges[i], corners[:, i] - NARROW) for i in range(free_axes.size)] for corners in (begins, ends)

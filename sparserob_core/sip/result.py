@@ -38,7 +38,7 @@ MEANING: Mapping[Status, str] = {
 SMALL_COST = 1e-6
 COLUMNS = ("outer", "epsilon", "value", "bound", "seconds")
 NOTE = "note_"
-POINTS = 500_000  # largest number of coordinates of tuples that a run keeps
+MAX_COORDINATES_KEPT = 500_000  # largest number of coordinates of tuples that a run keeps
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class SearchTrace:
     seconds : ndarray, shape (n,)
         Time since the start, in seconds.
     points : ndarray, shape (n, d)
-        Tuples of indices; ``(n, 0)`` where all of them would be more than `POINTS` numbers.
+        Tuples of indices; ``(n, 0)`` where all of them would be more than `MAX_COORDINATES_KEPT` numbers.
     notes : mapping of str to ndarray, shape (n,)
         Scalars that the maximiser noted, one column for each name; NaN where it noted nothing.
     polished : ndarray of bool, shape (n,)
@@ -108,7 +108,7 @@ class SearchTrace:
             last = rows[rows[:, 0] >= 1]
             notes[name] = np.full(count, np.nan)
             notes[name][last[:, 0].astype(int) - 1] = last[:, 1]
-        points = trace.points if 0 < trace.points.size <= POINTS else np.zeros((count, 0))
+        points = trace.points if 0 < trace.points.size <= MAX_COORDINATES_KEPT else np.zeros((count, 0))
         polished = np.arange(count) >= (count if trace.searched is None else trace.searched)
         return SearchTrace(
             np.full(count, outer),
@@ -139,7 +139,8 @@ class SearchTrace:
             np.concatenate([getattr(trace, name) for trace in parts]) for name in COLUMNS
         )
         kept = (
-            len({trace.points.shape[1] for trace in parts}) == 1 and sum(trace.points.size for trace in parts) <= POINTS
+            len({trace.points.shape[1] for trace in parts}) == 1
+            and sum(trace.points.size for trace in parts) <= MAX_COORDINATES_KEPT
         )
         points = np.concatenate([trace.points for trace in parts]) if kept else np.zeros((value.size, 0))
         names = dict.fromkeys(name for trace in parts for name in trace.notes)

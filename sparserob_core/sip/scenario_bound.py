@@ -11,7 +11,7 @@ import numpy as np
 from sparserob_core.arguments import whole
 from sparserob_core.errors import InputError
 
-SURE = 1e-6  # the probability beta of drawing scenarios for which a bound fails
+FAILURE_PROBABILITY = 1e-6  # the probability beta of drawing scenarios for which a bound fails
 
 
 @final
@@ -65,7 +65,7 @@ def at_most(bound: float) -> str:
     return f"{np.ceil(round(bound * 10.0**digits, 9)) / 10.0**digits:.2g}"
 
 
-def scenario_bound(scenarios: int, variables: int, support: int, beta: float = SURE) -> ScenarioBound:
+def scenario_bound(scenarios: int, variables: int, support: int, beta: float = FAILURE_PROBABILITY) -> ScenarioBound:
     """Return the bounds of a scenario program, from before and after its solution.
 
     Parameters
@@ -99,7 +99,7 @@ def scenario_bound(scenarios: int, variables: int, support: int, beta: float = S
     )
 
 
-def bound_before(scenarios: int, variables: int, beta: float = SURE) -> float:
+def bound_before(scenarios: int, variables: int, beta: float = FAILURE_PROBABILITY) -> float:
     """Return the ``epsilon`` with ``sum_{i < n} C(S, i) epsilon^i (1 - epsilon)^(S - i) = beta``; 1 when ``S < n``.
 
     ``S`` is the number of scenarios, ``n`` that of decision variables. The sum is a binomial tail, so ``epsilon`` is a
@@ -117,7 +117,7 @@ def bound_before(scenarios: int, variables: int, beta: float = SURE) -> float:
     return 1.0 - float(betaincinv(scenarios - variables + 1, variables, beta))
 
 
-def bound_after(scenarios: int, support: int, beta: float = SURE) -> float:
+def bound_after(scenarios: int, support: int, beta: float = FAILURE_PROBABILITY) -> float:
     """Return ``epsilon = 1 - t`` with ``beta / (S + 1) sum_{m=k}^S C(m, k) t^(m-k) = C(S, k) t^(S-k)``; 1 when ``k >=
     S``.
 

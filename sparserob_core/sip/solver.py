@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 
 # Rounding allowed in a residual, relative to the numbers added up in it: 64 units (Higham 2002, section 3.1). With a
 # tenth of it, an optimum to the last bit of numbers of a million is refused; with ten times as much, a digit is wasted.
-ROUNDING = 2.0**-46
+RESIDUAL_ROUNDING = 2.0**-46
 logger = logging.getLogger("sparserob")
 AUTO = "auto"  # the name of `Auto`
 # Approximate number of multiplications in a factorisation from which a program is solved in a process of its own where
 # time is limited: a tenth of a second for all iterations. Ten times as many take as long as a limit may be exceeded on
 # a busy machine. With a tenth, the start of the process, some milliseconds, would be noticed.
-LONG = 1e7
+SEPARATE_PROCESS_WORK = 1e7
 SHORTCUTS = frozenset({CLOSED_FORM, DUAL_NEWTON, HIGHS})
 NUMBERS = re.compile(r"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?")
 
@@ -244,7 +244,7 @@ class Claim:
             (np.abs(terms.sum(keepdims=True)), np.abs(terms).sum(keepdims=True)),
         )
         return signs <= accuracy and all(
-            amount.max(initial=0.0) <= max(accuracy, ROUNDING * float(sizes.max(initial=0.0)))
+            amount.max(initial=0.0) <= max(accuracy, RESIDUAL_ROUNDING * float(sizes.max(initial=0.0)))
             for amount, sizes in residuals
         )
 
@@ -552,7 +552,7 @@ class AccountedSolver(Solver):
         self.calls += 1
         self.failures.calls += 1
         solver = self.cones[0] if program.cones and self.cones is not None else self.solver
-        if POSSIBLE and (solver.aborts or (self.deadline.bounded and program.work > LONG)):
+        if POSSIBLE and (solver.aborts or (self.deadline.bounded and program.work > SEPARATE_PROCESS_WORK)):
             return call_apart(lambda: solver.solve(program, accuracy), self.deadline)
         return solver.solve(program, accuracy)
 

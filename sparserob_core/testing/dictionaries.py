@@ -12,8 +12,8 @@ from sparserob_core.testing.contract import Contract, broken, demand, same
 HORIZONS = (1.0, 0.3, 2.5, 1 / 3, 1e-3, 5400.0, 1.0)
 CONDITION = 1e10  # of the Gram matrix of the functions, each of norm 1
 SIZES = (1e-6, 1e6)  # of the largest value of a function
-SHORTEST = 1e-9  # piece, as a share of the horizon
-MOST = 20_000  # pieces
+SHORTEST_PIECE = 1e-9  # piece, as a share of the horizon
+DICTIONARY_PIECES = 20_000  # pieces
 
 
 class DictionaryContract(Contract[DictionaryFactory], kind="dictionary"):
@@ -57,16 +57,16 @@ class DictionaryContract(Contract[DictionaryFactory], kind="dictionary"):
             dictionary = self.built(factory, horizon)
             shortest = float(np.diff(dictionary.breakpoints).min()) / horizon
             demand(
-                shortest >= SHORTEST,
+                shortest >= SHORTEST_PIECE,
                 f"build({horizon:g}) has a piece of {shortest:.1e} of the horizon",
-                f"join pieces shorter than {SHORTEST:g} of the horizon with their neighbours: rounding eats them",
+                f"join pieces shorter than {SHORTEST_PIECE:g} of the horizon with their neighbours: rounding eats them",
             )
             demand(
-                1 <= dictionary.values.shape[1] <= MOST
+                1 <= dictionary.values.shape[1] <= DICTIONARY_PIECES
                 and dictionary.values.shape[1] == dictionary.breakpoints.size - 1,
                 f"build({horizon:g}) has values on {dictionary.values.shape[1]} of "
                 f"{dictionary.breakpoints.size - 1} pieces",
-                f"values have one column for each piece, of at most {MOST} pieces",
+                f"values have one column for each piece, of at most {DICTIONARY_PIECES} pieces",
             )
 
     def test_its_functions_are_linearly_independent(self) -> None:

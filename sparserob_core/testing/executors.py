@@ -22,8 +22,8 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.method import ExecutorFactory
 from sparserob_core.testing.contract import Contract, broken, demand
 
-CALLS = 12
-MOMENT = 0.05  # seconds that a call takes where it has to take some
+CALLS = 12  # that are submitted at once
+CALL_SECONDS = 0.05  # seconds that a call takes where it has to take some
 
 
 class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
@@ -58,7 +58,7 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
     def test_answers_come_in_the_order_of_the_arguments_whatever_is_ready_first(self) -> None:
         mend = "let `submit` return a future of its own for each call, and inherit `map` from `Executor`"
         with self.opened() as executor:
-            seconds = [MOMENT * ((CALLS - k) % 3) for k in range(CALLS)]
+            seconds = [CALL_SECONDS * ((CALLS - k) % 3) for k in range(CALLS)]
             try:
                 mapped = list(executor.map(late, range(CALLS), seconds, timeout=self.patience))
             except TimeoutError:
@@ -162,7 +162,7 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
         mend = "call `Future.set_running_or_notify_cancel` when a call begins, and leave it out where that is false"
         with TemporaryDirectory() as folder:
             with self.opened() as executor:
-                futures = [executor.submit(mark, folder, f"{k}", MOMENT) for k in range(CALLS)]
+                futures = [executor.submit(mark, folder, f"{k}", CALL_SECONDS) for k in range(CALLS)]
                 cancelled = [future.cancel() for future in reversed(futures)][::-1]
                 for k, future in enumerate(futures):
                     if cancelled[k]:
@@ -182,7 +182,7 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
         mend = "let `open` end with `shutdown(wait=True)`; drop nothing unless the context ends by an exception"
         with TemporaryDirectory() as folder:
             with self.opened() as executor:
-                futures = [executor.submit(mark, folder, f"{k}", MOMENT) for k in range(CALLS)]
+                futures = [executor.submit(mark, folder, f"{k}", CALL_SECONDS) for k in range(CALLS)]
             demand(all(future.done() for future in futures), "the context ended before its calls", mend)
             demand(not any(future.cancelled() for future in futures), "the end has cancelled calls", mend)
             answers = [future.result(0) for future in futures]
@@ -370,5 +370,5 @@ def dies() -> None:
 def interrupts_itself() -> str:
     """Send this process the signal that Ctrl-C in a terminal sends to a worker."""
     os.kill(os.getpid(), signal.SIGINT)
-    time.sleep(2 * MOMENT)
+    time.sleep(2 * CALL_SECONDS)
     return "still here"

@@ -22,10 +22,10 @@ ODD_BOXES = (
     ([-1e-9] * 3, [1e-9] * 3),
 )
 FIRST_POINT = 0.25
-"""Seconds until a search has to ask for its first value, the best of `TRIES`, for a method begins one in every
-iteration: ten times as long would let a second pass, and a tenth is what a loaded machine takes now and then."""
+"""Seconds until a search has to ask for its first value, the best of `MEASURED_STARTS`, for a method begins one in
+every iteration: ten times as long would let a second pass, and a tenth is what a loaded machine takes now and then."""
 
-TRIES = 3
+MEASURED_STARTS = 3  # whose best counts, since a loaded machine delays one
 
 
 def slope(points: Array) -> Array:
@@ -304,7 +304,7 @@ class MaximiserContract(Contract[Maximiser], kind="maximiser"):
 
     def test_the_first_point_comes_at_once(self) -> None:
         delays: list[float] = []
-        while len(delays) < TRIES and min(delays, default=np.inf) > FIRST_POINT:
+        while len(delays) < MEASURED_STARTS and min(delays, default=np.inf) > FIRST_POINT:
             delays.append(self.delay())
         demand(
             min(delays) <= FIRST_POINT,

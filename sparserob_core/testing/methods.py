@@ -25,8 +25,8 @@ from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 from sparserob_core.testing.contract import Contract, broken, demand, same
 
 DIP, WIDTH = 0.73713, 0.003  # where the narrow dip of `dipping` is, and how narrow
-CLOSE = 1e-6  # relative accuracy with which a claim is compared with what is known
-SAMPLES = 4_000
+CLAIM_ACCURACY = 1e-6  # relative accuracy with which a claim is compared with what is known
+DRAWN_SAMPLES = 4_000  # of an index set, at which a decision is examined; a tenth of them lie in the dip
 HONEST = "claim no more than was proven: `certified` and `verified` only where every family is proven at the decision"
 
 
@@ -246,7 +246,7 @@ class MethodContract(Contract[Method], kind="method"):
             for event in events:
                 if isinstance(event, RoundFinished):
                     demand(
-                        event.lower_bound <= case.value + CLOSE,
+                        event.lower_bound <= case.value + CLAIM_ACCURACY,
                         f"{case.name}: round {event.round} tells the lower bound {event.lower_bound:.9g}, and the "
                         f"value is {case.value:.9g}",
                         "tell bounds that are proven, -inf while there is none",
@@ -413,7 +413,7 @@ def _judge_bounds(one: Known, result: Result, scale: float) -> None:
         "the upper bound is the cost where the decision is proven, and inf where it is not",
     )
     demand(
-        result.lower_bound <= one.value + CLOSE * scale,
+        result.lower_bound <= one.value + CLAIM_ACCURACY * scale,
         f"{one.name}: the lower bound {result.lower_bound:.9g} is above the value {one.value:.9g}",
         "a lower bound comes from multipliers of the unregularised program (weak duality), or is -inf; the cost of a "
         "decision is none, and neither is what a solver says",
@@ -431,7 +431,7 @@ def _judge_bounds(one: Known, result: Result, scale: float) -> None:
         )
     else:
         demand(
-            result.lower_bound <= derived + CLOSE * scale,
+            result.lower_bound <= derived + CLAIM_ACCURACY * scale,
             f"{one.name}: the lower bound is said to be {result.lower_bound:.9g}; its multipliers prove {derived:.9g}",
             "return the multipliers that prove the lower bound as `dual`; `check` looks at them",
         )
@@ -505,9 +505,11 @@ def _judge_decision(one: Known, result: Result, x: Array, scale: float) -> None:
 def _sample_worst_violation(family: ConstraintFamily, x: Array) -> float:
     """The largest violation at many indices, near the dip of `dipping` above all; it proves nothing."""
     box, rng = family.index_set, np.random.default_rng(1)
-    spread = rng.random((SAMPLES, box.dimension))
+    spread = rng.random((DRAWN_SAMPLES, box.dimension))
     points = box.lower + spread * (box.upper - box.lower)
-    points[: SAMPLES // 10, 0] = np.clip(DIP + WIDTH * (spread[: SAMPLES // 10, 0] - 0.5), box.lower[0], box.upper[0])
+    points[: DRAWN_SAMPLES // 10, 0] = np.clip(
+        DIP + WIDTH * (spread[: DRAWN_SAMPLES // 10, 0] - 0.5), box.lower[0], box.upper[0]
+    )
     return float(family.violations(x, points).max())
 
 
@@ -520,7 +522,7 @@ def _judge_witness(one: Known, result: Result, x: Array) -> None:
         return
     violation = float(family.violations(x, np.asarray(worst.index)[None])[0, worst.row])
     demand(
-        violation > 0.0 and abs(violation - worst.violation) <= CLOSE * max(1.0, violation),
+        violation > 0.0 and abs(violation - worst.violation) <= CLAIM_ACCURACY * max(1.0, violation),
         f"{one.name}: the witness is said to be violated by {worst.violation:.6g}, and is by {violation:.6g}",
         "take the violation from `family.violations(decision, index)`, in the row that is named",
     )

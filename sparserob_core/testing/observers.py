@@ -60,10 +60,10 @@ METHODS: Mapping[str, Mapping[str, Any]] = {
     "infeasible": {"problem": {**CONFIG["problem"], "horizon": 0.5, "path": []}},
 }
 BROKEN_OFF = (1, 2, 4)  # the events after which a run is interrupted: at once, and in the middle
-EVENTS = 300
-GRACE = 5.0  # seconds that an observer may take to end its threads
+MEASURED_EVENTS = 300  # of which the median time is taken
+THREAD_GRACE_SECONDS = 5.0  # seconds that an observer may take to end its threads
 FRAMEWORK = "this is a fault of the framework, or of the contract; please report it"
-ALLOWED = 2e-3  # seconds that an event may take on the solver's thread, the median of many
+MAX_SECONDS_PER_EVENT = 2e-3  # seconds that an event may take on the solver's thread, the median of many
 
 
 @final
@@ -212,7 +212,7 @@ class ObserverContract(Contract[Observer], kind="observer"):
         observer, seconds = self.create(), []
         observer.receive(started())
         try:
-            for number in range(EVENTS):
+            for number in range(MEASURED_EVENTS):
                 event = bare_events()[2 if number % 3 else 0]
                 start = time.perf_counter()
                 observer.receive(event)
@@ -221,7 +221,7 @@ class ObserverContract(Contract[Observer], kind="observer"):
         finally:
             observer.close()
         demand(
-            float(np.median(seconds)) < ALLOWED,
+            float(np.median(seconds)) < MAX_SECONDS_PER_EVENT,
             f"an event takes {1e3 * float(np.median(seconds)):.1f} ms on the solver's thread",
             "put events into a `queue.SimpleQueue`, and let a thread of your own, begun at `RunStarted` and joined in "
             "`close`, do the work",
@@ -316,7 +316,7 @@ def nothing_left() -> Iterator[None]:
     """Fails when more threads are alive afterwards than before."""
     before = set(threading.enumerate())
     yield
-    deadline = time.monotonic() + GRACE
+    deadline = time.monotonic() + THREAD_GRACE_SECONDS
     while (new_threads := set(threading.enumerate()) - before) and time.monotonic() < deadline:
         time.sleep(0.01)
     demand(

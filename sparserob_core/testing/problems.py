@@ -21,16 +21,16 @@ if TYPE_CHECKING:
     from sparserob_core.sip.program import Separation
 
 DECISIONS = 4  # decisions at which families are looked at
-POINTS = 60  # indices that are drawn
-CELLS = 10  # cells that are drawn, with `INSIDE` indices in each
-INSIDE = 25
-STEP = 1e-6  # of the box's side, for differences
-SLOPE = 1e-3  # relative accuracy of a derivative
-CLOSE = 1e-8  # relative to the terms of a row
-SMALL = 1e-7  # cells whose enclosure must be close to the violation: of the side of the box
+DRAWN_INDICES = 60  # indices that are drawn
+DRAWN_CELLS = 10  # cells that are drawn, with `INDICES_PER_CELL` indices in each
+INDICES_PER_CELL = 25  # that are drawn in each of them
+DIFFERENCE_STEP = 1e-6  # of the box's side, for differences
+DERIVATIVE_ACCURACY = 1e-3  # relative accuracy of a derivative
+ROW_ACCURACY = 1e-8  # relative to the terms of a row
+SMALL_CELL_SIDE = 1e-7  # cells whose enclosure must be close to the violation: of the side of the box
 CLOSES = 1e-3  # how close, relative to the terms of a row
 PIECES = 12  # of the dictionaries in which a control problem is looked at
-SECONDS = 20.0  # that a solve may take
+SOLVE_SECONDS = 20.0  # that a solve may take
 
 
 class ProblemContract(Contract[ProblemFactory], kind="problem"):
@@ -97,7 +97,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
             "let nothing but the options decide: no clock, and no random numbers without a seed among the options",
         )
         for family, twin in zip(first.families, second.families, strict=True):
-            points = _sample_points(family.index_set, np.random.default_rng(1), POINTS)
+            points = _sample_points(family.index_set, np.random.default_rng(1), DRAWN_INDICES)
             x = np.random.default_rng(2).random(first.n)
             is_same = same(family.violations(x, points), twin.violations(x, points))
             if family.uncertain is None:
@@ -127,7 +127,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                 f"{family.name}: the index set is not bounded",
                 "the index set of a family is a bounded box: transform what runs to infinity",
             )
-            points = _sample_points(box, np.random.default_rng(3), POINTS)
+            points = _sample_points(box, np.random.default_rng(3), DRAWN_INDICES)
             if family.uncertain is not None:
                 continue
             G, h = _ask_rows(family, points)
@@ -170,7 +170,8 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                     rows = _ask_family(family, "uncertain", lambda f=family, p=point: f.uncertain(p))
                     excess, size = rows.excess(x, spread), _measure_size(family, x, point[None])
                     demand(
-                        excess.shape == violation.shape and np.abs(excess - violation).max(initial=0.0) <= CLOSE * size,
+                        excess.shape == violation.shape
+                        and np.abs(excess - violation).max(initial=0.0) <= ROW_ACCURACY * size,
                         f"{family.name}: the rows are violated by {excess[:3]} at {point}, and excess says "
                         f"{violation[:3]}",
                         "`excess` is the violation of the rows of `uncertain` at the worst deviation of the spread",
@@ -186,7 +187,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
             if family.gradient is None:
                 continue
             box, rng = family.index_set, np.random.default_rng(5)
-            points = _sample_points(box, rng, POINTS, margin=0.01)
+            points = _sample_points(box, rng, DRAWN_INDICES, margin=0.01)
             for x in decisions:
                 rows = rng.integers(0, _ask_rows(family, points)[1].shape[1], len(points))
                 gradients = _ask_family(family, "gradient", lambda f=family, x=x, p=points, r=rows: f.gradient(x, p, r))
@@ -202,21 +203,21 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
         for family, decisions in self.families():
             if family.worst is None:
                 continue
-            points = _sample_points(family.index_set, np.random.default_rng(6), 50 * POINTS)
+            points = _sample_points(family.index_set, np.random.default_rng(6), 50 * DRAWN_INDICES)
             for x in decisions:
                 separation = _ask_family(family, "worst", lambda f=family, x=x: f.worst(x))
                 size = _measure_size(family, x, points)
                 self._check_separation(family, x, separation, size)
                 sampled = float(family.violations(x, points).max())
                 demand(
-                    sampled <= separation.bound + CLOSE * size,
+                    sampled <= separation.bound + ROW_ACCURACY * size,
                     f"{family.name}: worst says that no violation is above {separation.bound:.9g}, and one "
                     f"is {sampled:.9g}",
                     "`bound` holds for the whole index set; give inf where none is proven",
                 )
                 top = float(separation.violations.max(initial=-np.inf))
                 demand(
-                    sampled <= top + CLOSE * size,
+                    sampled <= top + ROW_ACCURACY * size,
                     f"{family.name}: worst finds at most {top:.9g}, and a drawn index has {sampled:.9g}",
                     "name the most violated index of the whole set; leave `worst` out where it is not known exactly",
                 )
@@ -236,12 +237,12 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
         )
         violations = family.violations(x, found.indices)[np.arange(count), found.rows] if count else np.zeros(0)
         demand(
-            np.abs(violations - found.violations).max(initial=0.0) <= CLOSE * size,
+            np.abs(violations - found.violations).max(initial=0.0) <= ROW_ACCURACY * size,
             f"{family.name}: worst says {found.violations[:3]} where the rows say {violations[:3]}",
             "a violation is `row x - rhs` at the index and row that are named with it",
         )
         demand(
-            (np.diff(found.violations) <= CLOSE * size).all(),
+            (np.diff(found.violations) <= ROW_ACCURACY * size).all(),
             f"{family.name}: worst does not begin with the most violated constraint",
             "sort by falling violation",
         )
@@ -252,16 +253,17 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                 continue
             box, rng = family.index_set, np.random.default_rng(7)
             for x in decisions[:2]:
-                for share in (1.0, 0.2, 0.01, SMALL):
+                for share in (1.0, 0.2, 0.01, SMALL_CELL_SIDE):
                     lower, upper = _sample_cells(family, rng, share)
                     enclosure = _ask_family(
                         family, "enclosure", lambda f=family, x=x, a=lower, b=upper: f.enclosure(x, a, b)
                     )
                     samples = (
-                        lower[:, None] + rng.random((len(lower), INSIDE, box.dimension)) * (upper - lower)[:, None]
+                        lower[:, None]
+                        + rng.random((len(lower), INDICES_PER_CELL, box.dimension)) * (upper - lower)[:, None]
                     )
                     violations = family.violations(x, samples.reshape(-1, box.dimension))
-                    largest = violations.reshape(len(lower), INSIDE, -1).max(axis=(1, 2))
+                    largest = violations.reshape(len(lower), INDICES_PER_CELL, -1).max(axis=(1, 2))
                     size = _measure_size(family, x, samples.reshape(-1, box.dimension))
                     demand(
                         np.shape(enclosure.bounds) == np.shape(enclosure.split) == (len(lower),),
@@ -272,7 +274,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                     # Below 0 the scale of a row is its own affair: rows of a curved set are those of directions.
                     below = float((largest - np.maximum(enclosure.bounds, 0.0)).max())
                     demand(
-                        below <= CLOSE * size,
+                        below <= ROW_ACCURACY * size,
                         f"{family.name}: an enclosure is {below:.3g} below a violation in "
                         "its cell: what it proves is not true",
                         "bound every term of the row over the whole cell: the least of what is subtracted, the most of "
@@ -284,12 +286,12 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                         f"{family.name}: enclosure wants coordinate {split.max()} of {box.dimension} to be halved",
                         "name coordinates from 0, as whole numbers",
                     )
-                    if share == SMALL and self.provable:
+                    if share == SMALL_CELL_SIDE and self.provable:
                         gap = float((enclosure.bounds - largest).max())
                         demand(
                             gap <= CLOSES * size,
-                            f"{family.name}: on cells of {SMALL:g} of the index set the enclosure is still {gap:.3g} "
-                            "above the violation: no proof comes to its end",
+                            f"{family.name}: on cells of {SMALL_CELL_SIDE:g} of the index set the enclosure is still "
+                            f"{gap:.3g} above the violation: no proof comes to its end",
                             "the bound has to approach the violation as the cell shrinks; see that `cells` begin where "
                             "a row has a jump or a kink, or set `provable = False`",
                         )
@@ -315,7 +317,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                 f"{family.name}: the cells fill {volume:.6g} of the index set",
                 "cells cover the index set without a gap, and do not overlap but at their sides",
             )
-            points = _sample_points(box, np.random.default_rng(8), POINTS)
+            points = _sample_points(box, np.random.default_rng(8), DRAWN_INDICES)
             inside = np.all((points[:, None] >= lower) & (points[:, None] <= upper), axis=2)
             demand(
                 np.any(inside, axis=1).all(),
@@ -330,15 +332,15 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
             forms = {"nominal": family.nominal, "literal": family.literal}
             if family.sample is not None:
                 with suppress(InputError):
-                    forms["sampled"] = family.sample(POINTS, np.random.default_rng(9))
+                    forms["sampled"] = family.sample(DRAWN_INDICES, np.random.default_rng(9))
             for name, form in forms.items():
                 if form is None:
                     continue
-                points = _sample_points(form.index_set, np.random.default_rng(10), POINTS)
+                points = _sample_points(form.index_set, np.random.default_rng(10), DRAWN_INDICES)
                 for x in decisions:
                     bound, drawn = family.worst(x).bound, float(form.violations(x, points).max())
                     demand(
-                        drawn <= bound + CLOSE * _measure_size(form, x, points),
+                        drawn <= bound + ROW_ACCURACY * _measure_size(form, x, points),
                         f"{family.name}: its {name} form has a violation of {drawn:.9g}, the family itself at most "
                         f"{bound:.9g}",
                         "the nominal, the sampled and the literal form have some of the constraints, and no others",
@@ -379,7 +381,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
         if isinstance(problem, OptimalControlProblem):
             options = {"control": control} | ({} if self.policy is None else {"policy": self.policy})
         try:
-            result = solve(problem, seconds=SECONDS, **options)
+            result = solve(problem, seconds=SOLVE_SECONDS, **options)
         except InputError as error:
             broken(f"the exchange method refuses it: {error}", "see what the message says of the problem")
         demand(
@@ -441,7 +443,7 @@ def _sample_cells(family: ConstraintFamily, rng: np.random.Generator, share: flo
     """Cells whose sides are a share of those of the family's own cells, or of its index set."""
     box = family.index_set
     lower, upper = (box.lower[None], box.upper[None]) if family.cells is None else family.cells
-    cells = rng.integers(0, len(lower), CELLS)
+    cells = rng.integers(0, len(lower), DRAWN_CELLS)
     low, sides = lower[cells], (upper - lower)[cells]
     first = low + rng.random(low.shape) * (1.0 - share) * sides
     return first, np.minimum(first + share * sides, low + sides)
@@ -463,13 +465,13 @@ def _find_wrong_slopes(family: ConstraintFamily, x: Array, points: Array, rows: 
     values = family.violations(x, points)[k, rows]
     for i in np.flatnonzero(sides > 0.0):
         ahead, behind = points.copy(), points.copy()
-        ahead[:, i] += STEP * sides[i]
-        behind[:, i] -= STEP * sides[i]
+        ahead[:, i] += DIFFERENCE_STEP * sides[i]
+        behind[:, i] -= DIFFERENCE_STEP * sides[i]
         slopes = [
-            (family.violations(x, ahead)[k, rows] - values) / STEP,
-            (values - family.violations(x, behind)[k, rows]) / STEP,
+            (family.violations(x, ahead)[k, rows] - values) / DIFFERENCE_STEP,
+            (values - family.violations(x, behind)[k, rows]) / DIFFERENCE_STEP,
         ]
         errors = np.min([np.abs(told[:, i] * sides[i] - slope) for slope in slopes], axis=0)
         largest = np.max(np.abs(slopes), axis=0)
-        is_wrong |= errors > SLOPE * (largest + np.abs(told[:, i] * sides[i])) + 1e-6 * size
+        is_wrong |= errors > DERIVATIVE_ACCURACY * (largest + np.abs(told[:, i] * sides[i])) + 1e-6 * size
     return is_wrong

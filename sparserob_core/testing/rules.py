@@ -23,9 +23,9 @@ from sparserob_core.testing.contract import Contract, broken, demand
 
 FIRST = (1.0, 0.3, 1e3, 1e-4)  # weights at which a schedule begins
 STOP = 1e-6  # share of the first weight that a schedule has to come down to
-MOST = 5000  # iterations in which it has to
+MAX_ITERATIONS = 5000  # iterations in which it has to
 QUICK = 1e-3  # seconds of a rule that is asked after every batch of evaluations, the median of many
-DRAWS = 2000  # of a rule that draws
+RULE_DRAWS = 2000  # of a rule that draws
 SPREAD = 0.05  # of a share of so many draws
 
 
@@ -83,7 +83,7 @@ class ScheduleContract(Contract[Schedule], kind="rule", of=Schedule):
         schedule = self.create()
         for first in FIRST:
             epsilon, j = first, 0
-            while epsilon > STOP * first and j < MOST:
+            while epsilon > STOP * first and j < MAX_ITERATIONS:
                 j += 1
                 epsilon = self.weight(schedule, epsilon, j)
             yield first, epsilon
@@ -96,7 +96,7 @@ class ScheduleContract(Contract[Schedule], kind="rule", of=Schedule):
         for first, epsilon in self.descent():
             demand(
                 epsilon <= STOP * first,
-                f"from {first:g} the weight has come down to {epsilon:.3g} only after {MOST} iterations",
+                f"from {first:g} the weight has come down to {epsilon:.3g} only after {MAX_ITERATIONS} iterations",
                 "multiply by a factor clearly below 1, and add nothing to it",
             )
 
@@ -327,9 +327,9 @@ class SelectionContract(Contract[Selection], kind="rule", of=Selection):
         return truth(answer, call)
 
     def share(self, current: float, candidate: float, heat: float) -> float:
-        """Return the share of `DRAWS` trials in which a new rule accepts a candidate."""
+        """Return the share of `RULE_DRAWS` trials in which a new rule accepts a candidate."""
         rule, rng = self.create(), np.random.default_rng(5)
-        return float(np.mean([self.accepts(rule, current, candidate, heat, rng) for _ in range(DRAWS)]))
+        return float(np.mean([self.accepts(rule, current, candidate, heat, rng) for _ in range(RULE_DRAWS)]))
 
     def test_what_is_better_is_accepted_as_a_rule(self) -> None:
         for current, candidate in ((0.0, 1.0), (-5.0, -4.9), (1e6, 2e6)):

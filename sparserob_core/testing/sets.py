@@ -10,8 +10,8 @@ from sparserob_core.control.sets.sets import SetFactory
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.testing.contract import Contract, demand
 
-DIRECTIONS = 400
-CLOSE = 1e-7  # relative to the set's extent
+DRAWN_DIRECTIONS = 400  # in which a set is measured, beside the axes
+EXTENT_ACCURACY = 1e-7  # relative to the set's extent
 
 
 class SetContract(Contract[ConvexSet], kind="set"):
@@ -36,7 +36,7 @@ class SetContract(Contract[ConvexSet], kind="set"):
     def directions(self, convex: ConvexSet) -> Array:
         """Random directions ``(k, d)``, not normalised, and the axes both ways."""
         axes = np.eye(convex.dimension)
-        return np.vstack([np.random.default_rng(7).normal(size=(DIRECTIONS, convex.dimension)), axes, -axes])
+        return np.vstack([np.random.default_rng(7).normal(size=(DRAWN_DIRECTIONS, convex.dimension)), axes, -axes])
 
     def extent(self, convex: ConvexSet) -> float:
         """The longest side of the bounding box."""
@@ -58,7 +58,7 @@ class SetContract(Contract[ConvexSet], kind="set"):
     def test_a_support_point_attains_the_support_function_and_is_in_the_set(self) -> None:
         convex = self.create()
         c = self.directions(convex)
-        points, tolerance = convex.support_point(c), CLOSE * self.extent(convex)
+        points, tolerance = convex.support_point(c), EXTENT_ACCURACY * self.extent(convex)
         errors = np.abs((c * points).sum(axis=1) - convex.support(c)) / np.linalg.norm(c, axis=1)
         demand(
             (errors <= tolerance).all(),
@@ -76,7 +76,7 @@ class SetContract(Contract[ConvexSet], kind="set"):
         convex = self.create()
         c = self.directions(convex)
         e = c[::-1]
-        tolerance = CLOSE * self.extent(convex) * (1.0 + np.abs(c).max())
+        tolerance = EXTENT_ACCURACY * self.extent(convex) * (1.0 + np.abs(c).max())
         demand(
             (convex.support(c + e) <= convex.support(c) + convex.support(e) + tolerance).all(),
             "h(c + e) is above h(c) + h(e) somewhere: this is the support function of no set",
@@ -140,7 +140,7 @@ class SetContract(Contract[ConvexSet], kind="set"):
                 "return every side of the set, or None for a set that is not flat",
             )
             demand(
-                abs(-best.fun - convex.support(c[None])[0]) <= 10 * CLOSE * self.extent(convex),
+                abs(-best.fun - convex.support(c[None])[0]) <= 10 * EXTENT_ACCURACY * self.extent(convex),
                 f"in the direction {c} the half-spaces allow {-best.fun:.9g}, the support function "
                 f"{convex.support(c[None])[0]:.9g}",
                 "`halfspaces` returns H (r, d) and h (r,) of `H x <= h`, with all sides of the set and no others",
@@ -148,7 +148,7 @@ class SetContract(Contract[ConvexSet], kind="set"):
 
     def test_the_bounding_box_touches_the_set_on_every_side(self) -> None:
         convex = self.create()
-        box, axes, tolerance = convex.bounding_box(), np.eye(convex.dimension), CLOSE * self.extent(convex)
+        box, axes, tolerance = convex.bounding_box(), np.eye(convex.dimension), EXTENT_ACCURACY * self.extent(convex)
         demand(
             np.abs(box.upper - convex.support(axes)).max() <= tolerance
             and np.abs(box.lower + convex.support(-axes)).max() <= tolerance,
@@ -262,7 +262,7 @@ class SetContract(Contract[ConvexSet], kind="set"):
             "draw from the `rng` that is given only",
         )
         demand(
-            (self.excess(convex, points) <= CLOSE * self.extent(convex)).all(),
+            (self.excess(convex, points) <= EXTENT_ACCURACY * self.extent(convex)).all(),
             "a sample is outside of the set",
             "draw points of the set, not of its box; or leave `sample` out",
         )
@@ -291,7 +291,7 @@ class SetContract(Contract[ConvexSet], kind="set"):
         convex = self.create()
         c, middle = self.directions(convex), convex.middle()
         demand(
-            self.excess(convex, middle[None])[0] <= CLOSE * self.extent(convex),
+            self.excess(convex, middle[None])[0] <= EXTENT_ACCURACY * self.extent(convex),
             f"the middle {middle} is outside of the set",
             "leave `middle` out",
         )
@@ -323,7 +323,7 @@ class SetContract(Contract[ConvexSet], kind="set"):
 
     def test_the_support_function_stays_between_its_bounds_around_a_direction(self) -> None:
         convex, rng = self.create(), np.random.default_rng(3)
-        tolerance = CLOSE * self.extent(convex)
+        tolerance = EXTENT_ACCURACY * self.extent(convex)
         shifts = np.vstack([rng.uniform(-1.0, 1.0, (60, 2)), [[1, 1], [1, -1], [-1, 1], [-1, -1], [0, 0]]])
         for centre in self.directions(convex)[:12]:
             spread = rng.uniform(0.01, 1.0) * rng.normal(size=(2, convex.dimension))
@@ -356,7 +356,7 @@ class SetContract(Contract[ConvexSet], kind="set"):
         if image is not None:
             height = c @ image[0] + np.linalg.norm(c @ image[1], axis=1)
             demand(
-                np.allclose(height, convex.support(c), rtol=1e-9, atol=CLOSE * self.extent(convex)),
+                np.allclose(height, convex.support(c), rtol=1e-9, atol=EXTENT_ACCURACY * self.extent(convex)),
                 "the image of the ball has another support function than the set",
                 "return the centre (d,) and M (d, k) of the set `centre + M ball`, or None for what is no such image",
             )

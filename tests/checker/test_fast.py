@@ -129,7 +129,7 @@ def test_errors_of_execution_through_a_fast_lag_are_verified(rate: float, tmp_pa
 def test_on_a_busy_machine_no_other_bound_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With seconds of its own the bound without rounding was not ready under load, and an estimated one was told, 5e-13
     too high."""
-    monkeypatch.setattr(bound, "SECONDS", 0.0)
+    monkeypatch.setattr(bound, "BOUND_SECONDS", 0.0)
     assert verified(plant("execution", 17), tmp_path) == "certified"
 
 

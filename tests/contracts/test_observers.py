@@ -198,7 +198,7 @@ FAULTS = {
 @pytest.mark.slow
 @pytest.mark.parametrize(("flawed", "test"), FAULTS.items(), ids=[one.__name__ for one in FAULTS])
 def test_the_contract_catches_an_observer_that_is_bad_on_purpose(flawed, test, monkeypatch):
-    monkeypatch.setattr("sparserob_core.testing.observers.GRACE", 0.2)
+    monkeypatch.setattr("sparserob_core.testing.observers.THREAD_GRACE_SECONDS", 0.2)
     made = []
 
     def create():

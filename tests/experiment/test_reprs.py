@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.brief import LINES, WIDTH, brief
+from sparserob_core.brief import MAX_BRIEF_LINES, MAX_VALUE_LETTERS, brief
 from sparserob_core.checker.outcome import Finding
 
 OF_THEIR_OWN = {"Check", "Outcome", "Result", "ControlResult", "SolvedProblem", "Signal"}  # guarded beside them
@@ -39,8 +39,8 @@ def test_every_public_result_is_said_in_ten_lines_whatever_it_holds(name: str, l
         object.__setattr__(record, one.name, large)
     lines = repr(record).splitlines()
     assert lines[0] == name
-    assert 2 <= len(lines) <= LINES
-    assert max(map(len, lines)) <= WIDTH + len("  : ") + max(len(one.name) for one in fields(kind))
+    assert 2 <= len(lines) <= MAX_BRIEF_LINES
+    assert max(map(len, lines)) <= MAX_VALUE_LETTERS + len("  : ") + max(len(one.name) for one in fields(kind))
 
 
 def test_the_report_of_a_search_says_the_maximum_and_not_its_evaluations() -> None:
@@ -71,7 +71,7 @@ def test_fields_without_a_line_are_named_and_hidden_ones_are_not() -> None:
 
     assert repr(Many()).splitlines()[1] == "  a: 1"
     assert repr(Many()).splitlines()[-1] == "  and i, j"
-    assert len(repr(Many()).splitlines()) == LINES
+    assert len(repr(Many()).splitlines()) == MAX_BRIEF_LINES
 
 
 def many_states() -> sr.OptimalControlProblem:
@@ -103,8 +103,8 @@ def test_what_a_problem_is_made_of_is_said_in_ten_lines_too() -> None:
     for one in nouns:
         lines = repr(one).splitlines()
         assert lines[0].startswith(type(one).__name__)
-        assert len(lines) <= LINES
-        assert max(map(len, lines)) <= WIDTH + len("  disturbance_class: ")
+        assert len(lines) <= MAX_BRIEF_LINES
+        assert max(map(len, lines)) <= MAX_VALUE_LETTERS + len("  disturbance_class: ")
     assert "A=array (60, 60)" in repr(problem.system)
 
 
@@ -125,8 +125,8 @@ def test_a_check_says_its_verdict_first_and_which_claims_fail() -> None:
         "  seconds: 1",
     ]
     many = sr.Check("t" * 500, tuple(Finding(f"claim {k}", "fails", "long " * 90) for k in range(40)), 1.0)
-    assert len(repr(many).splitlines()) == LINES
-    assert max(map(len, repr(many).splitlines())) <= WIDTH + 2
+    assert len(repr(many).splitlines()) == MAX_BRIEF_LINES
+    assert max(map(len, repr(many).splitlines())) <= MAX_VALUE_LETTERS + 2
 
 
 def test_a_result_with_units_says_that_of_its_cost_and_a_controller_says_where_it_is() -> None:

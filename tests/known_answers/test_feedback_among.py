@@ -63,6 +63,6 @@ def test_where_a_second_objective_is_too_large_the_first_decides_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before, _ = solved(1, tmp_path / "any", among=None)
-    monkeypatch.setattr(robust, "MANY", 1)
+    monkeypatch.setattr(robust, "MAX_SECOND_VARIABLES", 1)
     after, _ = solved(1, tmp_path / "chosen")
     assert np.array_equal(np.asarray(before.result.decision), np.asarray(after.result.decision))

@@ -14,7 +14,7 @@ from sparserob_core.experiment.run import run as run_module
 from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.methods import exchange, sparsest
-from sparserob_core.sip.proof.branch_and_bound import CELLS
+from sparserob_core.sip.proof.branch_and_bound import MAX_PROOF_CELLS
 from sparserob_core.sip.working import tightening
 from sparserob_core.sip.working.ledger import prover_of
 from sparserob_core.sip.working.plain import PlainRows
@@ -311,7 +311,7 @@ def test_where_nothing_is_as_far_away_as_large_cells_ask_for_smaller_ones_prove(
     def coarse(program: Any, tools: Any) -> Any:
         proving = prover_of(program, tools)
 
-        def prover(x: Any, cells: int = CELLS) -> Any:
+        def prover(x: Any, cells: int = MAX_PROOF_CELLS) -> Any:
             open_ = Proof("path", "undecided", 1e3, index=np.array([2.0]), row=0, cells=1, formulation="reduced")
             return proving(x, cells) if cells > tightening.GLANCE else [open_]
 

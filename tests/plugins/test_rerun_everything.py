@@ -54,7 +54,7 @@ def told(file: Path, outcome: sr.Outcome) -> None:
 
 @pytest.fixture(autouse=True)
 def _landscapes_are_coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparserob_core.experiment.run.replay.PATIENCE", 1.0)
+    monkeypatch.setattr("sparserob_core.experiment.run.replay.LANDSCAPE_SECONDS", 1.0)
 
 
 def both(config: str, changes: dict[str, object], directory: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -279,8 +279,25 @@ def test_every_public_name_can_be_imported() -> None:
     assert not [name for name in sparserob_core.__all__ if getattr(sparserob_core, name) is None]
 
 
+DECISIONS = sorted((ROOT / "docs" / "decisions").glob("0*.md"))
+
+
 def test_every_decision_has_a_number_of_its_own() -> None:
-    numbers = [page.name[:4] for page in sorted((ROOT / "docs" / "decisions").glob("0*.md"))]
+    numbers = [page.name[:4] for page in DECISIONS]
     assert len(numbers) > 50 and len(set(numbers)) == len(numbers)
-    for page in (ROOT / "docs" / "decisions").glob("0*.md"):
+    for page in DECISIONS:
         assert page.read_text().startswith(f"# {int(page.name[:4])}. "), page.name
+
+
+def test_a_decision_has_at_most_800_words_and_leaves_measurements_to_the_page_of_performance() -> None:
+    lengths = {page.name: len(page.read_text().split()) for page in DECISIONS}
+    assert not {name: length for name, length in lengths.items() if length > 800}
+
+
+def test_the_changelog_has_one_line_for_each_entry_and_at_most_120_of_them_for_a_version() -> None:
+    for version in (ROOT / "CHANGELOG.md").read_text().split("\n## ")[1:]:
+        heading, *sections = version.split("\n### ")
+        entries = [line for section in sections for line in section.split("\n")[1:] if line]
+        assert sections and len(entries) <= 120, heading.split("\n")[0]
+        assert {section.split("\n")[0] for section in sections} <= {"Breaking", "Added", "Changed", "Fixed", "Removed"}
+        assert not [entry for entry in entries if not entry.startswith("- ") or len(entry) > 240]

@@ -14,7 +14,13 @@ from scipy.sparse import block_diag, csc_array, csr_array, diags_array, eye_arra
 import sparserob_core as sr
 from sparserob_core.experiment.cli.main import _run_command_line
 from sparserob_core.sip import convexity
-from sparserob_core.sip.convexity import ROUNDED, convex_by_construction, is_definite, is_semidefinite, require_convex
+from sparserob_core.sip.convexity import (
+    ENTRY_ROUNDING,
+    convex_by_construction,
+    is_definite,
+    is_semidefinite,
+    require_convex,
+)
 
 FAMILY = sr.ConstraintFamily(
     name="f", index_set=sr.Box([0.0], [1.0]),
@@ -176,7 +182,7 @@ def test_a_direction_that_refuses_a_form_shows_it(n, seed, monkeypatch):
     P[k, k] *= 1.0 - 1e-3
     for full in (0.0, 2.0):
         monkeypatch.setattr(convexity, "FULL", full)
-        monkeypatch.setattr(convexity, "DENSE", 0)
+        monkeypatch.setattr(convexity, "MAX_DENSE_ROWS", 0)
         direction = convexity._find_negative_direction(P)
         size = np.sqrt(P.diagonal())
         if direction is None:
@@ -299,5 +305,5 @@ def test_a_look_costs_little_beside_the_solution(kind, monkeypatch):
 
 def test_the_share_that_is_rounding_is_that_of_thirteen_digits():
     """Ten times larger, and this hollow would pass; ten times smaller, and long products would not."""
-    assert is_semidefinite(csc_array([[1.0, 1.0 + ROUNDED], [1.0 + ROUNDED, 1.0]]))
-    assert not is_semidefinite(csc_array([[1.0, 1.0 + 10 * ROUNDED], [1.0 + 10 * ROUNDED, 1.0]]))
+    assert is_semidefinite(csc_array([[1.0, 1.0 + ENTRY_ROUNDING], [1.0 + ENTRY_ROUNDING, 1.0]]))
+    assert not is_semidefinite(csc_array([[1.0, 1.0 + 10 * ENTRY_ROUNDING], [1.0 + 10 * ENTRY_ROUNDING, 1.0]]))

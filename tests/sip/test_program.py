@@ -162,7 +162,7 @@ def test_cells_may_overlap_stand_still_along_a_side_and_miss_by_rounding():
 
 
 def test_a_grid_that_is_too_large_is_compared_by_volume(monkeypatch):
-    monkeypatch.setattr("sparserob_core.sip.program.PARTS", 1)
+    monkeypatch.setattr("sparserob_core.sip.program.MAX_GRID_PARTS", 1)
     box = sr.Box([0.0, 0.0], [1.0, 1.0])
     assert uncovered(np.zeros((1, 2)), np.ones((1, 2)), box) is None
     assert uncovered(np.zeros((1, 2)), np.array([[1.0, 0.999]]), box) is not None

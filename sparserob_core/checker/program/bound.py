@@ -25,7 +25,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.stated.statement import StatedProgram
 from sparserob_core.sip.stated.terms import AffineFunction
 
-MAX_ENTRIES = 300  # in products with each other: twice as many take eight times as long, a minute
+MAX_JOINED_ENTRIES = 300  # in products with each other: twice as many take eight times as long, a minute
 MAX_EXACT = 60  # in products whose sum is 0 along a line: fractions grow, and twice as many take sixteen times as long
 INDEPENDENT = 1e-11  # of the largest entry: a smaller pivot is rounding, and a larger one gives wide balls at worst
 
@@ -97,8 +97,10 @@ class Lagrangian:
             raise Broken("the objective is not convex")
         if self.is_diagonal:
             return
-        if len(entries) > MAX_ENTRIES:
-            raise Unchecked(f"products of more than {MAX_ENTRIES} entries of the decision are not shown to be convex")
+        if len(entries) > MAX_JOINED_ENTRIES:
+            raise Unchecked(
+                f"products of more than {MAX_JOINED_ENTRIES} entries of the decision are not shown to be convex"
+            )
         table = [[self.quadratic.get((i, j), arb(0)) for j in entries] for i in entries]
         for k, pivot_row in enumerate(table):
             if not pivot_row[k] > 0:

@@ -24,9 +24,11 @@ from sparserob_core.sip.expressions.statements import StatedRow
 DEGREES = {1: (24, 0), 2: (7, 7), 3: (4, 4)}
 """Orders in the first coordinate and in the others, for so many of them; 2 for more. Half of them need ten times as
 many cells, twice as many take four times as long for each."""
-SHARP = 0.01  # of a limit: bounds above it are sharpened, since what is excused is priced; with a tenth it is rounding
-SHARPENED = 5  # halvings for that: ten times as many follow what really violates to the last digit, two are too few
-MAX_CELLS = 20_000  # of one row: ten times as many take hours, a tenth refuses filters of a thousand taps
+# Of a limit: bounds above it are sharpened, since what is excused is priced; with a tenth it is rounding
+SHARPENED_SHARE = 0.01
+# Halvings for that: ten times as many follow what really violates to the last digit, two are too few
+SHARPENING_HALVINGS = 5
+MAX_ROW_CELLS = 20_000  # of one row: ten times as many take hours, a tenth refuses filters of a thousand taps
 
 
 def bound_violation(rows: ExpressionRows, x: Array, limit: float, clock: Clock) -> float:
@@ -43,10 +45,10 @@ def bound_violation(rows: ExpressionRows, x: Array, limit: float, clock: Clock) 
         clock.check()
         lower, upper, sharpened, open_rows = work.pop()
         bounded += len(open_rows)
-        if bounded > MAX_CELLS * len(rows.rows):
-            raise Unchecked(f"more than {MAX_CELLS} cells of each row such as {open_rows[0].text!r} are needed")
+        if bounded > MAX_ROW_CELLS * len(rows.rows):
+            raise Unchecked(f"more than {MAX_ROW_CELLS} cells of each row such as {open_rows[0].text!r} are needed")
         bounds, models = _bound_cell(rows, open_rows, frame, decision, lower, upper)
-        is_closed = bounds <= (SHARP * limit if sharpened < SHARPENED else limit)
+        is_closed = bounds <= (SHARPENED_SHARE * limit if sharpened < SHARPENING_HALVINGS else limit)
         worst = max(worst, bounds[is_closed].max(initial=-np.inf))
         if is_closed.all():
             continue

@@ -17,7 +17,7 @@ from sparserob_core.control.sets.directions import across, on_surface, sampled, 
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import ConstraintFamily, Explanation, Separation
 
-CLIMBED = 16  # pieces, those furthest outside, whose direction is refined per round
+CLIMBED_PIECES = 16  # pieces, those furthest outside, whose direction is refined per round
 
 
 CONTROL, RATE, STEP = "control", "rate", "control_step"
@@ -187,7 +187,7 @@ class ControlConstraint(ConstraintSource):
         largest gauge less 1 over all places, which is exact but for rounding."""
         points = self._evaluate_places(x)
         outside = self.set.gauge(points) - 1.0
-        places = np.argsort(-outside, kind="stable")[:CLIMBED]
+        places = np.argsort(-outside, kind="stable")[:CLIMBED_PIECES]
         z = sampled(self.set.dimension)
         c = unit(self.set, z)
         start = z[(points[places] @ c.T - self.set.support(c)).argmax(axis=1)]

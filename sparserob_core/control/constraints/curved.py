@@ -34,11 +34,11 @@ from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.expressions.taylor import Combination, combination
 from sparserob_core.sip.program import Enclosure, Separation
 
-SAMPLED = 8  # samples in any direction that are climbed from, beside the maxima along time
+CLIMBED_SAMPLES = 8  # samples in any direction that are climbed from, beside the maxima along time
 # Of the longest direction of a cell, what its shortest is taken for when it is said where to halve; a bound that may be
 # 0 would say nothing of the others.
 SHORTEST, TINY = 1e-3, float(np.finfo(float).tiny)
-STEP = 0.1  # first step of directions, on the cube of edge 2
+FIRST_STEP = 0.1  # first step of directions, on the cube of edge 2
 
 
 @final
@@ -102,14 +102,14 @@ class CurvedConstraint(StateConstraint):
         flat, box, times = self._outer_constraint, self.index_set, self._outer_constraint.times
         values = flat.on_lattice(x)
         worst_indices, heights = self._find_worst_indices(x, values)
-        samples = local_maxima(values, flat.lattice[1], SAMPLED)
-        samples = samples[np.argsort(-values[tuple(samples.T)], kind="stable")][:SAMPLED]
+        samples = local_maxima(values, flat.lattice[1], CLIMBED_SAMPLES)
+        samples = samples[np.argsort(-values[tuple(samples.T)], kind="stable")][:CLIMBED_SAMPLES]
         sample_points = self._build_indices(vertices(values, samples, times)[0], samples)
         step = np.concatenate(
             [
                 [np.max(np.diff(times), initial=0.0)],
                 (box.upper - box.lower)[1 : 1 + self.parameters.count] / 4,
-                np.full(self._cube_dimension, STEP),
+                np.full(self._cube_dimension, FIRST_STEP),
             ]
         )
 
@@ -158,7 +158,7 @@ class CurvedConstraint(StateConstraint):
             c = unit(self.set, z) / self.unit
             return np.asarray(along(c, which) - self.set.support(c) - (c * moves[which]).sum(axis=1))
 
-        start = np.full(self._cube_dimension, STEP)
+        start = np.full(self._cube_dimension, FIRST_STEP)
         z, violations = climb(height, indices[:, first:], start, lambda z: on_surface(np.clip(z, -1.0, 1.0)))
         ends = np.hstack([indices[:, :first], z])
         return ends, self._compute_violations(x, ends) if self._has_integrals else violations

@@ -26,7 +26,7 @@ from sparserob_core.sip.program import (
     told_apart,
 )
 
-SAME = 1e-12  # of the largest coefficient of a combination, one that is rounding
+NEGLIGIBLE_TERM = 1e-12  # of the largest coefficient of a combination, one that is rounding
 
 
 class ConstraintSource(ABC):
@@ -213,12 +213,16 @@ class TimedExplanation(Explanation):
             return super().apart(other, share, amount)
         if self.gain is not None or other.gain is not None:
             gain, other_gain = (np.zeros(1) if side.gain is None else side.gain for side in (self, other))
-            gains_differ = np.abs(gain + share * other_gain) > SAME * max(np.abs(gain).max(), np.abs(other_gain).max())
-            differs = np.abs(self.direction + share * other.direction) > SAME * np.abs(self.direction).max(initial=0.0)
+            gains_differ = np.abs(gain + share * other_gain) > NEGLIGIBLE_TERM * max(
+                np.abs(gain).max(), np.abs(other_gain).max()
+            )
+            differs = np.abs(self.direction + share * other.direction) > NEGLIGIBLE_TERM * np.abs(self.direction).max(
+                initial=0.0
+            )
             if gains_differ.any() or differs.any():
                 return super().apart(other, share, amount)
         residual = self.direction + share * other.direction
-        residual = np.where(np.abs(residual) <= SAME * np.abs(self.direction).max(), 0.0, residual)
+        residual = np.where(np.abs(residual) <= NEGLIGIBLE_TERM * np.abs(self.direction).max(), 0.0, residual)
         allowed = self.sign * self.limit + share * other.sign * other.limit
         shift = self.sigma + share * other.sigma
         if residual.any():
@@ -368,7 +372,7 @@ def explanation(
             ("disturbance", sigma - contributions.initial_support),
             ("initial state", contributions.initial_support),
         )
-        if distance > SAME * sigma
+        if distance > NEGLIGIBLE_TERM * sigma
     ]
     cause = " and ".join(names) or "disturbance"
     quantity, where = (

@@ -24,15 +24,15 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.finite import UncertainRows
 from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation, Separation
 
-KEPT = 64  # separated times for each row and round
+SEPARATED_TIMES_PER_ROW = 64  # separated times for each row and round
 ZOOMED, ZOOMS, CLOSER = 9, 14, 4.0  # samples around a maximum, and how often they are drawn so many times closer
 NEAR, FEW = 1e-3, 4  # maxima that are so near to their limit are refined, and so many in any case
 HALVINGS, HALVED = 14, 200  # how often samples are drawn closer, and how many intervals at a time
 HIDDEN, SHARE = 2e-10, 0.2  # a violation that samples may miss; the share of the largest that they may
 FIRST_TIMES = 20  # times of a window that a method begins with
 STATES = 60_000_000  # numbers in the states that are sampled at once
-IDLE = 1e-14  # of the largest coefficient, one that is rounding
-SAME = 1e-12  # of the largest one, a singular value of equations that depend on one another
+NEGLIGIBLE_COEFFICIENT = 1e-14  # of the largest coefficient, one that is rounding
+DEPENDENT_EQUATION_SHARE = 1e-12  # of the largest one, a singular value of equations that depend on one another
 
 
 def not_linear(indices: Array) -> tuple[Array, Array]:
@@ -216,11 +216,11 @@ class FeedbackConstraint(ConstraintSource):
         """Return the nearest decision that meets an equality to rounding; one that no control enters is left as it
         is."""
         table, rhs = self.uncertain(np.array([self.flat.stop])).equations
-        has_control = abs(table).max(axis=1).toarray().ravel() > IDLE * abs(table).max()
+        has_control = abs(table).max(axis=1).toarray().ravel() > NEGLIGIBLE_COEFFICIENT * abs(table).max()
         table, rhs = table[has_control], rhs[has_control]
         square = (table @ table.T).toarray()
         for _ in range(2):
-            x = x + table.T @ np.linalg.lstsq(square, rhs - table @ x, rcond=SAME)[0]
+            x = x + table.T @ np.linalg.lstsq(square, rhs - table @ x, rcond=DEPENDENT_EQUATION_SHARE)[0]
         return x
 
     @cached_property
@@ -235,13 +235,13 @@ class FeedbackConstraint(ConstraintSource):
     def worst(self, x: Array) -> Separation:
         """Return the largest local maxima of the violation over the window, refined between the samples."""
         times, values = self._sample_violations(x)
-        positions = local_maxima(values.T[None], (1,), KEPT)
+        positions = local_maxima(values.T[None], (1,), SEPARATED_TIMES_PER_ROW)
         rows, at = positions[:, 1], positions[:, 2]
         best, violations = times[at].copy(), values[at, rows].copy()
         width = np.maximum(
             times[np.minimum(at + 1, times.size - 1)] - times[at], times[at] - times[np.maximum(at - 1, 0)]
         )
-        likely = np.argsort(-violations, kind="stable")[: 4 * KEPT]
+        likely = np.argsort(-violations, kind="stable")[: 4 * SEPARATED_TIMES_PER_ROW]
         likely = likely[
             (violations[likely] > -NEAR * np.abs(self.flat.h[rows[likely]])) | (np.arange(likely.size) < FEW)
         ]
@@ -331,7 +331,7 @@ class FeedbackConstraint(ConstraintSource):
         rows = self.uncertain(np.array([self.flat.stop]))
         size = np.abs(rows.d) * self.loop.spread.radii
         bare = np.array([np.diff(C.indptr) == 0 for C in rows.C])
-        return np.asarray((bare & (size > SAME * np.abs(self.flat.H).max())).any(axis=1)[rows.part])
+        return np.asarray((bare & (size > DEPENDENT_EQUATION_SHARE * np.abs(self.flat.H).max())).any(axis=1)[rows.part])
 
 
 def acting(loop: ClosedLoop, places: Places, x: Array) -> tuple[Array, Array]:

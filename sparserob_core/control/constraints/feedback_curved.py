@@ -15,7 +15,7 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.constraints.control import Places
-from sparserob_core.control.constraints.curved import STEP
+from sparserob_core.control.constraints.curved import FIRST_STEP
 from sparserob_core.control.constraints.explanation import ConstraintSource, TimedExplanation, of_gauge
 from sparserob_core.control.constraints.feedback import acting, describe_deviations, indexed, rows_at
 from sparserob_core.control.constraints.local_maxima import climb
@@ -26,7 +26,7 @@ from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.finite import UncertainRows
 from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation, Separation
 
-FIRST_TIMES = 5  # places that a method begins with, in the directions of the axes
+FIRST_PLACES = 5  # places that a method begins with, in the directions of the axes
 
 
 @final
@@ -59,7 +59,7 @@ class FeedbackCurvedControl(ConstraintSource):
         cube, times = np.ones(self._cube_dimension), self.places.times
         low, high = (ends[position] for ends, position in zip(self.places.spans, (0, -1), strict=True))
         index_set = Box(np.append(low, -cube), np.append(high, cube))
-        positions = np.unique(np.linspace(0, times.size - 1, min(FIRST_TIMES, times.size)).round().astype(int))
+        positions = np.unique(np.linspace(0, times.size - 1, min(FIRST_PLACES, times.size)).round().astype(int))
         axes = np.vstack([np.eye(self._cube_dimension), -np.eye(self._cube_dimension)])
         start = np.hstack([np.repeat(times[positions], len(axes))[:, None], np.tile(axes, (positions.size, 1))])
         family = indexed(self, index_set, start, self)
@@ -104,7 +104,7 @@ class FeedbackCurvedControl(ConstraintSource):
         z, violations = climb(
             lambda at, which: self._compute_violations(controls[which], at),
             start,
-            np.full(self._cube_dimension, STEP),
+            np.full(self._cube_dimension, FIRST_STEP),
             lambda at: on_surface(np.clip(at, -1.0, 1.0)),
         )
         order = np.argsort(-violations, kind="stable")

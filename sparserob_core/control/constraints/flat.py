@@ -12,7 +12,7 @@ import numpy as np
 
 from sparserob_core.control.constraints.explanation import TimedExplanation, explanation
 from sparserob_core.control.constraints.local_maxima import (
-    TINY,
+    LEAST_DIVISOR,
     along_spans,
     climb,
     find_kink_neighbours,
@@ -40,21 +40,21 @@ from sparserob_core.sip.program import Enclosure, Separation
 if TYPE_CHECKING:
     from sparserob_core.control.reach.execution import Execution
 
-SURE = 1e-8  # a vertex that is predicted to this accuracy is one
+VERTEX_ACCURACY = 1e-8  # a vertex that is predicted to this accuracy is one
 NEARER, LOOKS = 8, 4  # an unsure vertex is predicted from samples so many times nearer, and so often
 ARRIVED = 1e-11  # what a vertex that was arrived at may still promise
 INSIDE, MAX_INSIDE = 3, 64  # times sampled inside every piece, beside its ends: more where the system moves on it
 STENCIL = np.array([-1.0, 0.0, 1.0])
-SMOOTH = 0.1  # norm of A times the spacing of samples between which a parabola is a good guide
-CLIMBED = 10  # largest number of candidates that are climbed from, in parameters, or in time beside a kink
-KEPT = 64  # separated constraints per row and round
+MAX_SPACING_NORM = 0.1  # norm of A times the spacing of samples between which a parabola is a good guide
+CLIMBED_CANDIDATES = 10  # largest number of candidates that are climbed from, in parameters, or in time beside a kink
+SEPARATED_CONSTRAINTS_PER_ROW = 64  # separated constraints per row and round
 # Numbers of the rows that are imposed along the spans of one row, of which there is at least one. On 10 000 pieces four
 # controls had 268 rows in the first round where 64 say as much, and took twice the time; on 100 000 eight for each row
 # took half as long again as one.
 SPANNED = 2**19
 # Pieces from which maxima well below 0 are told as they were sampled. With a tenth of them ordinary runs tell less;
 # with ten times as many every round of a long one refines thousands.
-MANY = 1000
+SAMPLED_ONLY_PIECES = 1000
 FOUND_KEPT = 1  # decisions whose separation is remembered
 
 
@@ -118,7 +118,7 @@ class Samples:
             return self.undivided[0].times
         grid, (start, stop) = self._response.grid, self.window
         pace = float(np.linalg.norm(self._response.steps(self.lattice[0]).A, axis=(2, 3)).max())
-        counts = np.clip(np.ceil(pace * grid.lengths / SMOOTH), INSIDE + 1, MAX_INSIDE).astype(int)
+        counts = np.clip(np.ceil(pace * grid.lengths / MAX_SPACING_NORM), INSIDE + 1, MAX_INSIDE).astype(int)
         sample_numbers = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         inside = np.repeat(grid.breakpoints[:-1], counts) + sample_numbers * np.repeat(grid.lengths / counts, counts)
         inside = np.concatenate([inside[(inside > start) & (inside < stop)], self.cuts])
@@ -325,13 +325,13 @@ class FlatConstraint(StateConstraint):
     @shaped
     def _compute_separation(self, x: Float[Array, " n"]) -> Separation:
         values = self.on_lattice(x)
-        positions = local_maxima(values, self.lattice[1], KEPT)
-        spans = max(1, min(KEPT, SPANNED // x.size))
+        positions = local_maxima(values, self.lattice[1], SEPARATED_CONSTRAINTS_PER_ROW)
+        spans = max(1, min(SEPARATED_CONSTRAINTS_PER_ROW, SPANNED // x.size))
         positions = np.concatenate(
             [
                 positions,
                 along_spans(values, positions, self.pieces, spans),
-                find_kink_neighbours(values, self.times, self.kinks, KEPT),
+                find_kink_neighbours(values, self.times, self.kinks, SEPARATED_CONSTRAINTS_PER_ROW),
             ]
         )
         heights, rows = values[tuple(positions.T)], positions[:, 1]
@@ -339,7 +339,7 @@ class FlatConstraint(StateConstraint):
         violations = heights
         times, predicted = vertices(values, positions, self.times)
         between = np.flatnonzero(times != indices[:, 0])  # the others are samples
-        if self.parameters.count or self.functionals.response.grid.pieces >= MANY:
+        if self.parameters.count or self.functionals.response.grid.pieces >= SAMPLED_ONLY_PIECES:
             # among many samples, those well below 0 are only told
             promised = heights + 4.0 * (predicted - heights)
             between = between[promised[between] >= min(0.0, heights.max(initial=-np.inf))]
@@ -350,7 +350,7 @@ class FlatConstraint(StateConstraint):
             between = between[higher]
             indices[between, 0], violations[between] = (array[higher] for array in refined)
         if self.parameters.count:
-            likely = np.argsort(-violations, kind="stable")[:CLIMBED]
+            likely = np.argsort(-violations, kind="stable")[:CLIMBED_CANDIDATES]
             # a maximum at a breakpoint is a kink: it is climbed along, not across
             indices[likely], violations[likely] = self._climb_candidates(x, indices[likely], rows[likely])
         order = np.argsort(-violations, kind="stable")
@@ -510,11 +510,11 @@ class FlatConstraint(StateConstraint):
             before, now, after = samples.T
             slope, curvature = (after - before) / 2, 2 * now - before - after
             is_inside = np.abs(slope) < curvature
-            share = slope / np.where(is_inside, curvature, np.maximum(np.abs(slope), TINY))
+            share = slope / np.where(is_inside, curvature, np.maximum(np.abs(slope), LEAST_DIVISOR))
             error, size = np.abs(violations[live] - now), np.maximum(1.0, np.abs(now))
             is_sure = is_inside & (share * slope <= 2 * ARRIVED * size)
             if look == 0:
-                is_sure |= error <= SURE * size
+                is_sure |= error <= VERTEX_ACCURACY * size
             middle[live], violations[live] = at, now
             highest = max(float(violations.max()), float(heights.max()))
             is_relevant = now + 4.0 * np.maximum(error, np.abs(slope)) >= min(0.0, highest)
@@ -525,7 +525,7 @@ class FlatConstraint(StateConstraint):
             middle[live] = np.where(is_unfinished, at + steps * share, at)
             width[live] = np.where(is_inside, steps / NEARER, steps)
             live = live[is_unfinished]
-        kinks = live[np.argsort(-violations[live], kind="stable")][:CLIMBED]
+        kinks = live[np.argsort(-violations[live], kind="stable")][:CLIMBED_CANDIDATES]
         if kinks.size and not self.parameters.count:
             points, violations[kinks] = self._climb_candidates(x, indices[kinks], rows[kinks])
             middle[kinks] = points[:, 0]

@@ -9,26 +9,26 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
-SMALLEST = 1e-6  # of the first step: a step that is not made smaller any more
-CLIMBED = 16  # maxima along time at which a curved set is left, that are climbed from
+SMALLEST_STEP_SHARE = 1e-6  # of the first step: a step that is not made smaller any more
+CLIMBED_MAXIMA = 16  # maxima along time at which a curved set is left, that are climbed from
 NEARER, LOOKS = 8, 2  # the others are narrowed down to so many times nearer, and so often
 UNSURE = 4.0  # by how much the rise that a parabola predicts may be wrong
-CLOSE = 1e-6  # found maxima that are one, in times and on the cube of directions
+SAME_FOUND_DISTANCE = 1e-6  # found maxima that are one, in times and on the cube of directions
 # Indices of a curved set that are found at once, and those told where nothing is violated. With ten times fewer of the
 # first, rounds grow with the length of a wall that is ridden; with ten times more, there are more than help.
 MAX_RETURNED, FEWEST_RETURNED = 64, 8
-TURNS = 4  # directions at a time in which a curved set may be left
+DIRECTIONS_PER_TIME = 4  # directions at a time in which a curved set may be left
 # Of them and of times, from how many directions are climbed to. With ten times fewer, a violation beside a wall that is
 # ridden for long is left to the proof, which meets one a round.
-HELD = 2048
-NEAR = 0.02  # of the way out of a set, how near its wall a sample must be to be looked at
-MOVES = 120  # steps at most
-ENOUGH = 0.002  # a step that gains less than this share of the value is followed by a smaller one
+MAX_CLIMBS = 2048
+MIN_GAUGE_SHORTFALL = 0.02  # of the way out of a set, how near its wall a sample must be to be looked at
+MAX_CLIMB_STEPS = 120  # steps at most
+MIN_STEP_GAIN = 0.002  # a step that gains less than this share of the value is followed by a smaller one
 # multiples of the last moves that are tried besides, to follow a ridge (Hooke and Jeeves 1961)
 AGAIN = np.array([[1.0], [3.0]])
-STEPS = 6  # to points where a gradient is highest on a set, at most
+MAX_GRADIENT_STEPS = 6  # to points where a gradient is highest on a set, at most
 SHARES = np.array([1.0, 0.5, 0.2, 0.05])  # of such a step that are tried
-TINY = 1e-300  # instead of nothing to divide by
+LEAST_DIVISOR = 1e-300  # instead of nothing to divide by
 INWARD, DIFFERENCE = 1e-3, 1e-7  # shares of the set: how far inside it differences are taken, and how large
 
 
@@ -102,10 +102,10 @@ def find_kink_neighbours(values: Array, times: Array, kinks: np.ndarray, kept: i
 
 
 def turns(heights: Array, neighbours: np.ndarray, unit: float) -> tuple[np.ndarray, int]:
-    """Return positions ``(k, 2)`` in ``heights (r, times)`` of local maxima over directions, at most `TURNS` at a time,
-    and how many of them are to be climbed from. These are the first ones: those that may be above 0 between the sampled
-    directions, but at least `FEWEST_RETURNED` and at most `HELD`. ``neighbours (r, j)``: the numbers of the directions
-    that are neighbours of each.
+    """Return positions ``(k, 2)`` in ``heights (r, times)`` of local maxima over directions, at most
+    `DIRECTIONS_PER_TIME` at a time, and how many of them are to be climbed from. These are the first ones: those that
+    may be above 0 between the sampled directions, but at least `FEWEST_RETURNED` and at most `MAX_CLIMBS`. ``neighbours
+    (r, j)``: the numbers of the directions that are neighbours of each.
 
     The worst case of a disturbance that has corners has several maxima: what lies between sampled directions may make
     any of them the largest.
@@ -117,13 +117,13 @@ def turns(heights: Array, neighbours: np.ndarray, unit: float) -> tuple[np.ndarr
         np.minimum(lowest, neighbour_heights, out=lowest)
     is_peak = heights >= highest
     promise = np.where(is_peak, 2.0 * heights - lowest, -np.inf)
-    order = np.argsort(-np.where(is_peak, heights, -np.inf), axis=0, kind="stable")[:TURNS]
+    order = np.argsort(-np.where(is_peak, heights, -np.inf), axis=0, kind="stable")[:DIRECTIONS_PER_TIME]
     rows, times = order.ravel(), np.tile(np.arange(heights.shape[1]), len(order))
     promised = promise[rows, times]
     first = np.argsort(-promised, kind="stable")
     first = first[: int(is_peak[rows, times].sum())]
-    likely = int((promised[first] * unit > -NEAR).sum())
-    return np.stack([rows[first], times[first]], axis=1), min(HELD, max(FEWEST_RETURNED, likely))
+    likely = int((promised[first] * unit > -MIN_GAUGE_SHORTFALL).sum())
+    return np.stack([rows[first], times[first]], axis=1), min(MAX_CLIMBS, max(FEWEST_RETURNED, likely))
 
 
 def highest_at(times: np.ndarray, heights: Array) -> np.ndarray:
@@ -178,7 +178,7 @@ def ridden(
     points = held[peaks[:, 2]]
     points[:, 0] = vertex_times
     order = np.argsort(-promised, kind="stable")
-    first, remaining = order[:CLIMBED], order[CLIMBED:]
+    first, remaining = order[:CLIMBED_MAXIMA], order[CLIMBED_MAXIMA:]
     remaining = remaining[promised[remaining] > 0.0]
     sample_positions = np.concatenate([peaks[:, 2], spans])  # at a kink a parabola is no guide
     nearer = _move_to_vertices(points[remaining], float(np.diff(times).max(initial=0.0)), turned)
@@ -202,7 +202,7 @@ def _move_to_vertices(
         neighbours[:, 0] += np.tile(width * np.array([-1.0, 0.0, 1.0]), len(points))
         before, now, after = turned(neighbours)[1].reshape(-1, 3).T
         slope, curvature = (after - before) / 2, 2 * now - before - after
-        share = slope / np.where(np.abs(slope) < curvature, curvature, np.maximum(np.abs(slope), TINY))
+        share = slope / np.where(np.abs(slope) < curvature, curvature, np.maximum(np.abs(slope), LEAST_DIVISOR))
         points[:, 0] += width * share
         width /= NEARER
     return turned(points)
@@ -213,7 +213,7 @@ def _select_distinct(indices: Array, found: Array) -> np.ndarray:
     remaining, kept = np.argsort(-found, kind="stable"), []
     while remaining.size:
         kept.append(int(remaining[0]))
-        remaining = remaining[(np.abs(indices[remaining] - indices[remaining[0]]) > CLOSE).any(axis=1)]
+        remaining = remaining[(np.abs(indices[remaining] - indices[remaining[0]]) > SAME_FOUND_DISTANCE).any(axis=1)]
     return np.array(kept, dtype=int)
 
 
@@ -249,9 +249,9 @@ def climb(
     if dimension <= 3:
         stencil = np.array([step for step in product((-1.0, 0.0, 1.0), repeat=dimension) if any(step)])
     numbers = np.arange(points.shape[0])
-    size, smallest = np.tile(radius, (points.shape[0], 1)), SMALLEST * radius
+    size, smallest = np.tile(radius, (points.shape[0], 1)), SMALLEST_STEP_SHARE * radius
     best, last = evaluate(points, numbers), np.zeros_like(points)
-    for _ in range(MOVES):
+    for _ in range(MAX_CLIMB_STEPS):
         live = np.flatnonzero((size > smallest).any(axis=1))
         if not live.size:
             break
@@ -266,7 +266,7 @@ def climb(
         last[live] = np.where(is_better[:, None], highest - points[live] + last[live] / 2, 0.0)
         points[live[is_better]] = highest[is_better]
         best[live[is_better]] = value[is_better]
-        size[live[gain <= ENOUGH * np.abs(best[live])]] /= 3
+        size[live[gain <= MIN_STEP_GAIN * np.abs(best[live])]] /= 3
     return points, best
 
 
@@ -282,7 +282,7 @@ def step_out(
     points, values, middle = points.copy(), values.copy(), convex.interior_point()
     axes = np.eye(middle.size)
     numbers, moves = np.arange(values.size), DIFFERENCE * convex.width(axes) * axes
-    for _ in range(STEPS):
+    for _ in range(MAX_GRADIENT_STEPS):
         inner = np.repeat(points[:, None], 2 * middle.size, axis=1)
         inner[:, :, 1:] += INWARD * (middle - inner[:, :, 1:]) + np.vstack([moves, -moves])
         ahead, behind = np.split(
@@ -290,7 +290,7 @@ def step_out(
             2,
             axis=1,
         )
-        gradient = (ahead - behind) / np.maximum(np.diag(moves), TINY)
+        gradient = (ahead - behind) / np.maximum(np.diag(moves), LEAST_DIVISOR)
         trials = np.repeat(points[:, None], SHARES.size, axis=1)
         trials[:, :, 1:] += SHARES[:, None] * (convex.support_point(gradient)[:, None] - trials[:, :, 1:])
         trial_values = evaluate(trials.reshape(-1, points.shape[1]), numbers.repeat(SHARES.size)).reshape(

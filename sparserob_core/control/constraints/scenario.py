@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sparserob_core.control.constraints.flat import KEPT
+from sparserob_core.control.constraints.flat import SEPARATED_CONSTRAINTS_PER_ROW
 from sparserob_core.control.constraints.local_maxima import local_maxima, vertices
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.disturbance import DisturbanceModel
@@ -17,7 +17,7 @@ from sparserob_core.control.response.time_grid import SAME_TIME, distinct_times
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import ConstraintFamily, Explanation, Separation
 
-BLOCK = 2_000_000  # sampled violations that are held at once
+MAX_VIOLATIONS_PER_BLOCK = 2_000_000  # sampled violations that are held at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class ScenarioConstraint:
     def worst(self, x: Array) -> Separation:
         """Return local maxima in time of the worst sample's violation, at the breakpoints and between them."""
         values, sample = self._find_worst_samples(x)
-        positions = local_maxima(values[None], (1,), KEPT)
+        positions = local_maxima(values[None], (1,), SEPARATED_CONSTRAINTS_PER_ROW)
         times = vertices(values[None], positions, self._times)[0]
         rows = positions[:, 1]
         indices = np.stack([times, sample[rows, positions[:, 2]].astype(float)], axis=1)
@@ -133,7 +133,7 @@ class ScenarioConstraint:
         samples."""
         samples, r, times = self.parameters.shape[0], self.h.size, self._times.size
         best, best_sample = np.full((r, times), -np.inf), np.zeros((r, times), dtype=int)
-        size = max(1, BLOCK // (r * times))
+        size = max(1, MAX_VIOLATIONS_PER_BLOCK // (r * times))
         for start in range(0, samples, size):
             chunk = slice(start, start + size)
             values = np.einsum("ri,sti->srt", self.H, states(chunk)) - self.h[:, None]

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import SAME, ConstraintSource, TimedExplanation
+from sparserob_core.control.constraints.explanation import NEGLIGIBLE_TERM, ConstraintSource, TimedExplanation
 from sparserob_core.control.problem.names import unit_of_row
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.reach.functional import WorstFunctionals
@@ -21,7 +21,7 @@ from sparserob_core.sip.program import Enclosure, Separation
 # The size of a row that has none, in its unit: bound, width and nominal values are 0, as those of a control that is to
 # be 0. A billionth of it is excused, which is above the remainders of series that enclose a 0, and no rounding of any
 # number that a row could have. A ten-thousandth of it leaves such rows open.
-NOTHING = 2.0**-140
+EMPTY_ROW_UNIT = 2.0**-140
 
 
 class StateConstraint(ConstraintSource):
@@ -185,7 +185,7 @@ class StateConstraint(ConstraintSource):
         if key not in self._scales:
             self._scales.clear()
             least = float(np.maximum(sizes, self._compute_row_sizes(x, rows))[small].min(initial=1.0))
-            self._scales[key] = max(least, NOTHING)
+            self._scales[key] = max(least, EMPTY_ROW_UNIT)
         return self._scales[key]
 
     def _compute_row_sizes(self, x: Array, rows: Array) -> Array:
@@ -214,7 +214,7 @@ class StateConstraint(ConstraintSource):
             assert self.sides is not None
             normals = self.sides[0][row : row + 1]
         size = np.abs(normals)
-        return np.asarray((size > SAME * size.max(initial=0.0)).any(axis=0))
+        return np.asarray((size > NEGLIGIBLE_TERM * size.max(initial=0.0)).any(axis=0))
 
     @property
     def measured(self) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.expressions.elementary import eccentric_anomaly
 from sparserob_core.sip.expressions.rounding import EPSILON
-from sparserob_core.sip.expressions.taylor import OUTWARD, TaylorSpace, taylor_space
+from sparserob_core.sip.expressions.taylor import OUTWARD_FACTOR, TaylorSpace, taylor_space
 
 Value: TypeAlias = Any
 """A float, or anything else with arithmetic, such as a `TaylorModel`."""
@@ -542,7 +542,7 @@ class ExpandedSystem:
         truncated = law[:, self.space.degrees > space.degree].sum(axis=1)
         if self.remainder is not None:
             truncated = truncated + self.remainder.over(ends)
-        remainder = TruncationBound(ends, truncated * OUTWARD) if truncated.any() else None
+        remainder = TruncationBound(ends, truncated * OUTWARD_FACTOR) if truncated.any() else None
         return ExpandedSystem(self.d, space, (low + high) / 2, (high - low) / 2, remainder), kept
 
     def shares(self, parameters: Array) -> Array:

@@ -17,7 +17,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
 SAME_BREAKPOINT = 1e-9  # of the horizon: how far a time may be from the breakpoint that it means
-ROUNDING_SHARE = 1e-7  # of the size of a state, a deviation that is rounding
+DEVIATION_ROUNDING = 1e-7  # of the size of a state, a deviation that is rounding
 
 
 @final
@@ -280,13 +280,15 @@ class Controller:
             centre, axes = np.asarray(problem.initial_state, dtype=float), np.eye(state.size)
             deviation, size = state - centre, np.abs(state) + np.abs(centre)
             if problem.initial_set is None:
-                return bool((np.abs(deviation) <= ROUNDING_SHARE * np.maximum(size, size.max())).all())
-            tolerance = ROUNDING_SHARE * float(problem.initial_set.reach(axes).max() + size.max())
+                return bool((np.abs(deviation) <= DEVIATION_ROUNDING * np.maximum(size, size.max())).all())
+            tolerance = DEVIATION_ROUNDING * float(problem.initial_set.reach(axes).max() + size.max())
             return float(problem.initial_set.violation(deviation)) <= tolerance
         if self._reach_bounds is None or self._last_state is None:
             return True
         lower, upper = (bound[: self._state_count] for bound in self._reach_bounds)
-        tolerance = ROUNDING_SHARE * max(float(np.abs(lower).max()), float(np.abs(upper).max()), np.finfo(float).tiny)
+        tolerance = DEVIATION_ROUNDING * max(
+            float(np.abs(lower).max()), float(np.abs(upper).max()), np.finfo(float).tiny
+        )
         user_state = state[: self._state_count]
         return bool(
             (user_state >= lower - tolerance).all() and (user_state <= upper + tolerance).all()
@@ -298,7 +300,9 @@ class Controller:
         lower, upper = (
             bound[self._next_piece - self._plan.first] for bound in self._plan.known.answering.loop.expected
         )
-        tolerance = ROUNDING_SHARE * float(np.max([np.abs(outputs), np.abs(innovation), np.abs(lower), np.abs(upper)]))
+        tolerance = DEVIATION_ROUNDING * float(
+            np.max([np.abs(outputs), np.abs(innovation), np.abs(lower), np.abs(upper)])
+        )
         return bool((innovation >= lower - tolerance).all() and (innovation <= upper + tolerance).all())
 
     def _has_admissible_cause(self, state: Array, room: float) -> bool:
@@ -311,7 +315,7 @@ class Controller:
             return True
         block, value, residual, growth = cause
         residual = residual[: self._state_count]
-        margin = growth * room + ROUNDING_SHARE * float(np.abs(value).max())
+        margin = growth * room + DEVIATION_ROUNDING * float(np.abs(value).max())
         is_new_block = self._last_disturbance is None or self._last_disturbance[0] != block
         is_same = is_new_block or bool((np.abs(value - self._last_disturbance[1]) <= 2.0 * margin).all())  # type: ignore[index]
         self._last_disturbance = (block, value)

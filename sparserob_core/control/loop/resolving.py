@@ -34,7 +34,7 @@ from sparserob_core.sip.working.ledger import Violated, prover_of
 PROVEN = ("certified", "verified")
 WHOLE = 10.0  # times what it takes to write a whole program down: a solution takes more
 BETTER = 1e-6  # of the cost of what is left: less than that is no better
-HALVINGS = 50  # of the way to a curved edge of the controls; a tenth ends 3 % before it, more is below rounding
+EDGE_HALVINGS = 50  # of the way to a curved edge of the controls; a tenth ends 3 % before it, more is below rounding
 
 
 @final
@@ -142,7 +142,7 @@ class ProvenPlan:
             return control
         if flat is None:
             inside, outside = 0.0, 1.0  # shares of the way from the nominal control
-            for _ in range(HALVINGS):
+            for _ in range(EDGE_HALVINGS):
                 share = (inside + outside) / 2
                 is_inside = float(bound.violation(nominal + share * (control - nominal))) <= 0.0
                 inside, outside = (share, outside) if is_inside else (inside, share)

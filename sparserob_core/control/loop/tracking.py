@@ -25,15 +25,15 @@ from sparserob_core.sip.inner.simplex.counterpart import Growing
 from sparserob_core.sip.program import TOLERANCE
 
 PARTS, LEVELS = 32, 3  # a cell that is open is cut in so many parts, so many times
-SHARP = 2  # the level on which the instant of a new row lies at least
-TERMS = 8  # of the Taylor expansion that bounds a curvature
-ROUND_OFF = 2.0**-46  # of the numbers that are added up
-MARGIN = 2e-9  # by which rows are tightened, in their own units
-ROUNDS = 40  # of adding rows
-NUMBERS = 8_000_000  # in the map from controls to states, at most
-FEW = 400  # open cells that are looked at closer, at most
+MIN_LEVEL = 2  # the level on which the instant of a new row lies at least
+TAYLOR_TERMS = 8  # of the Taylor expansion that bounds a curvature
+PLAN_ROUNDING = 2.0**-46  # of the numbers that are added up
+TIGHTENING = 2e-9  # by which rows are tightened, in their own units
+MAX_ROUNDS = 40  # of adding rows
+MAX_MAP_NUMBERS = 8_000_000  # in the map from controls to states, at most
+MAX_REFINED_CELLS = 400  # open cells that are looked at closer, at most
 KEPT, RECENT = 40, 200  # rows at most, before one begins anew with those that had one of so many multipliers
-SAME = 1e-9  # of a piece: an end of a window that is a breakpoint
+SAME_BREAKPOINT_SHARE = 1e-9  # of a piece: an end of a window that is a breakpoint
 
 
 @final
@@ -71,7 +71,10 @@ def trackable(own: Transcription) -> bool:
         is_uniform = (
             is_uniform and model.kind == "piecewise_constant" and model.starts is not None and model.starts.size == K
         )
-    if not (is_plain and is_linear and is_uniform) or K * K * problem.system.states * problem.system.controls > NUMBERS:
+    if (
+        not (is_plain and is_linear and is_uniform)
+        or K * K * problem.system.states * problem.system.controls > MAX_MAP_NUMBERS
+    ):
         return False
     is_flat = all(isinstance(constraint, FlatConstraint) and constraint.gains is None and not constraint.reference.moves
                   for constraint in own.constraints)  # fmt: skip
@@ -80,7 +83,7 @@ def trackable(own: Transcription) -> bool:
         [t for constraint in own.constraints for t in (constraint.start, constraint.stop)],
     )
     places = np.array(ends) * K / problem.horizon
-    is_on_grid = bool((np.abs(places - np.rint(places)) <= SAME).all())
+    is_on_grid = bool((np.abs(places - np.rint(places)) <= SAME_BREAKPOINT_SHARE).all())
     return is_flat and is_on_grid and bool((box.lower <= 0.0).all() and (box.upper >= 0.0).all())
 
 
@@ -141,13 +144,13 @@ class Tracking:
         self.limits: tuple[Array, Array, Array] = (problem.prices(own.control.breakpoints).ravel(), low, high)
         factors = [1.0]
         self.rates = [self.H @ self.A]
-        for order in range(1, TERMS):
+        for order in range(1, TAYLOR_TERMS):
             factors.append(factors[-1] / order)
             self.rates.append(self.rates[-1] @ self.A)
         self.factors = np.array(factors)
         self.last = np.linalg.norm(self.rates[-1] @ self.A, axis=1)
         self.growth = float(np.linalg.norm(self.A, 2))
-        self._summation = np.tile(np.eye(self.h.size), (TERMS, 1))
+        self._summation = np.tile(np.eye(self.h.size), (TAYLOR_TERMS, 1))
         self._series: dict[float, tuple[Array, Array]] = {}
         self._blocks: dict[tuple[int, int], _Instants] = {}
         self._offsets: dict[int, tuple[Array, Array]] = {}
@@ -166,15 +169,15 @@ class Tracking:
             )
         self._flat_nodes = self.nodes.reshape(-1, self.nodes.shape[2])
         self._power_magnitudes = np.abs(self.powers)
-        self._row_roundings = ROUND_OFF * np.abs(self.H).T
+        self._row_roundings = PLAN_ROUNDING * np.abs(self.H).T
         number = np.arange(self.K + 1)[:, None]
         self._is_active_node = (number >= self.start) & (number <= self.stop)
         self._is_active_piece = (number[:-1] >= self.start) & (number[:-1] < self.stop)
         effects = np.abs(self._support_values)
-        self._rounding_errors = self.sizes @ self._row_roundings + ROUND_OFF * (
+        self._rounding_errors = self.sizes @ self._row_roundings + PLAN_ROUNDING * (
             np.abs(self.h) + effects.max(axis=0, initial=0.0)
         )
-        self._rounding_errors = self._rounding_errors + ROUND_OFF * magnitudes
+        self._rounding_errors = self._rounding_errors + PLAN_ROUNDING * magnitudes
         self._recent_instants: list[
             tuple[int, int, int, int]
         ] = []  # rows that had a multiplier, those of the last states last
@@ -196,9 +199,9 @@ class Tracking:
         if len(self._row_instants) > KEPT:
             self._drop_idle_rows()
         nominal, (weights, low, high) = self._propagate_uncontrolled(state), self.limits
-        for round_ in range(ROUNDS):
+        for round_ in range(MAX_ROUNDS):
             h = self._right_hand_sides - self._state_rows @ state
-            self._program.limit(np.arange(h.size), h - MARGIN)
+            self._program.limit(np.arange(h.size), h - TIGHTENING)
             solved, _, parts, y = self._program.solve(until - time.monotonic())
             if not solved:
                 return None
@@ -291,7 +294,7 @@ class Tracking:
         is_open = (np.maximum(heights[:-1], heights[1:]) + curvature + noise > TOLERANCE) & self._is_active_piece
         cells = [(int(k), 0) for k in np.flatnonzero(is_open.any(axis=1))]
         for level in range(1, LEVELS + 1):
-            if not cells or len(cells) > FEW:
+            if not cells or len(cells) > MAX_REFINED_CELLS:
                 break
             instants, open_cells = list[tuple[int, int, int, int]](), list[tuple[int, int]]()
             width = self.length / PARTS**level
@@ -332,7 +335,7 @@ class Tracking:
         saves the rounds that would approach the peak row by row."""
         instants = []
         for row, piece, level, number in places:
-            while level < SHARP:
+            while level < MIN_LEVEL:
                 size, candidates = PARTS**level, list[tuple[float, int, int]]()
                 for before in (1, 0):  # the cells that end and begin in the instant
                     k, cell = (piece - 1, size - 1) if number < before else (piece, number - before)
@@ -358,8 +361,8 @@ class Tracking:
                 *rates.shape[:-1], self.h.size
             )
         if width not in self._series:
-            powers = np.cumprod([1.0] + [width] * TERMS)
-            tail = self.factors[-1] / TERMS * powers[-1] * np.exp(self.growth * width)
+            powers = np.cumprod([1.0] + [width] * TAYLOR_TERMS)
+            tail = self.factors[-1] / TAYLOR_TERMS * powers[-1] * np.exp(self.growth * width)
             terms = np.array(self.rates) * (self.factors * powers[:-1])[:, None, None]  # (TERMS, R, d)
             self._series[width] = terms.reshape(-1, rates.shape[-1]).T.copy(), tail * self.last
         terms, tail = self._series[width]

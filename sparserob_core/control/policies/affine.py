@@ -11,7 +11,8 @@ from sparserob_core.control.policies.policy import Charge, InnerGain, Policy, Qu
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
 
-SAME = 1e-12  # of the horizon: what is older than `memory` by less is not; ten times less and breakpoints that are sums
+# Of the horizon: what is older than `memory` by less is not; ten times less and breakpoints that are sums
+MEMORY_ALLOWANCE = 1e-12
 # of steps fall out by rounding, ten times more and nobody would see it before pieces are as short as that
 
 
@@ -65,7 +66,7 @@ class AffinePolicy(Policy, Options):
         """Return the truth values ``(K, K)`` of the answered innovations: all that are measured by then, or those no
         older than ``memory``."""
         starts = breakpoints[:-1]
-        oldest = np.inf if self.memory is None else self.memory + SAME * breakpoints[-1]
+        oldest = np.inf if self.memory is None else self.memory + MEMORY_ALLOWANCE * breakpoints[-1]
         answered: np.ndarray = np.tril(starts[:, None] - starts <= oldest)
         return answered
 

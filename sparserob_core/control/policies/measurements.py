@@ -14,7 +14,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import dense
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound
 
-SAME = (
+LATENCY_ALLOWANCE = (
     1e-12  # of the horizon: what is known by less later than a breakpoint is known at it; ten times less and a latency
 )
 # of a whole piece is one piece more by rounding, ten times more and nobody would see it
@@ -114,6 +114,6 @@ class Measurements(Term):
     def known(self, breakpoints: Array) -> np.ndarray:
         """Truth values ``(K, K)``: whether the control on piece ``k`` may know what was measured at breakpoint ``j``,
         of the ``breakpoints (K + 1,)`` of the control's dictionary."""
-        starts, late = breakpoints[:-1], self.latency - SAME * breakpoints[-1]
+        starts, late = breakpoints[:-1], self.latency - LATENCY_ALLOWANCE * breakpoints[-1]
         is_known: np.ndarray = np.tril(starts[:, None] - starts >= late)
         return is_known

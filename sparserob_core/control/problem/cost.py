@@ -18,7 +18,7 @@ from sparserob_core.control.term import TERMS, UNITLESS, Term, measured, timed
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import dense
 from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
-from sparserob_core.sip.convexity import ROUNDED, is_definite, require_convex
+from sparserob_core.sip.convexity import ENTRY_ROUNDING, is_definite, require_convex
 
 EXACT = 16  # rows up to which a matrix is shown to be positive semidefinite in fractions
 
@@ -277,7 +277,7 @@ def _require_semidefinite(path: str, Q: Array) -> Array:
     """
     form = require_convex(path, Q, Q.shape[0])
     Q, diagonal = form.toarray(), form.diagonal()
-    small, kept = ROUNDED * Q.shape[0], np.flatnonzero(diagonal > 0.0)
+    small, kept = ENTRY_ROUNDING * Q.shape[0], np.flatnonzero(diagonal > 0.0)
     if form.nnz == np.count_nonzero(diagonal) or (Q.shape[0] <= EXACT and _is_exactly_semidefinite(Q)):
         return Q
     if is_definite(form[kept][:, kept], 1.0 - 2.0 * small):

@@ -18,7 +18,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-MAX_VALUES = 100_000_000  # entries of the largest table of values that is made (0.8 GB)
+MAX_TABLE_VALUES = 100_000_000  # entries of the largest table of values that is made (0.8 GB)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -156,7 +156,7 @@ class Dictionary:
         Raises `InputError` where the table would take more than 0.8 GB.
         """
         N, K = self.functions, self.pieces
-        if N * K > MAX_VALUES:
+        if N * K > MAX_TABLE_VALUES:
             raise InputError(
                 f"the values of {N} functions on {K} pieces would take {8e-9 * N * K:.1f} GB;"
                 " expected less than 0.8 GB: ask for control(theta), gathered(weights), at(pieces) or sparse",

@@ -15,7 +15,8 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
 KINDS = {"states": "x", "controls": "u", "disturbances": "w"}
-ROUNDING = 1e-12  # relative to the largest entry of a direction; the order of summation changes a product by less
+# Relative to the largest entry of a direction; the order of summation changes a product by less
+NEGLIGIBLE_DIRECTION_ENTRY = 1e-12
 
 
 @final
@@ -121,7 +122,9 @@ class Corners:
             return None
         d, size = self.added
         components, largest = np.array([direction[:d] @ corner[:, d:] for corner in self.rows]), np.abs(direction).max()
-        matches = np.abs(components - direction[d:size]).max(axis=1, initial=0.0) <= ROUNDING * largest
+        matches = (
+            np.abs(components - direction[d:size]).max(axis=1, initial=0.0) <= NEGLIGIBLE_DIRECTION_ENTRY * largest
+        )
         if not matches.any():
             return None
         values = self.values[matches]
@@ -324,7 +327,7 @@ def unit_of_row(normal: npt.NDArray[np.float64], names: Names, states: int | Non
         The number of states; all coefficients belong to states unless given.
     """
     sizes = np.abs(normal)
-    numbers = (sizes == 1.0).any() or abs(np.linalg.norm(sizes) - 1.0) <= ROUNDING
+    numbers = (sizes == 1.0).any() or abs(np.linalg.norm(sizes) - 1.0) <= NEGLIGIBLE_DIRECTION_ENTRY
     return measured_in(normal, names, states) if numbers else ""
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import noun
-from sparserob_core.control.problem.tracing import SAME
+from sparserob_core.control.problem.tracing import EXPRESSION_ROUNDING
 from sparserob_core.control.sets.sets import Box
 from sparserob_core.control.sets.strangers import require_consistent
 from sparserob_core.errors import InputError, NotEnclosable
@@ -613,7 +613,7 @@ class Phase:
         """
         numeric = self._call_function(name, centre)
         excess = np.abs(numeric - value) - remainder
-        if not (excess <= SAME * np.abs(numeric).max()).all():
+        if not (excess <= EXPRESSION_ROUNDING * np.abs(numeric).max()).all():
             i, j = (int(i) for i in np.unravel_index(int(excess.argmax()), excess.shape))
             raise InputError(
                 path=f"system.{name}",

@@ -24,7 +24,7 @@ from sparserob_core.control.problem.disturbances import (
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
-from sparserob_core.control.problem.terms.repeat import RETURN, SAME, Repeating, ending, widths
+from sparserob_core.control.problem.terms.repeat import RETURN, SET_ROUNDING, Repeating, ending, widths
 from sparserob_core.control.problem.terms.windows import (
     MixedConstraint,
     PathConstraint,
@@ -414,7 +414,7 @@ class OptimalControlProblem(Term):
         bound = checked_set("initial_set", self.initial_set, self.system.states, "states", bounded=True)
         axes = np.eye(bound.dimension)
         size = float(bound.reach(axes).max())
-        if not bound.contains(np.zeros(bound.dimension), SAME * size):
+        if not bound.contains(np.zeros(bound.dimension), SET_ROUNDING * size):
             raise InputError(
                 path="initial_set",
                 expected="a set of deviations that holds 0, so that the centre is one of the initial states",

@@ -10,7 +10,7 @@ import numpy as np
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError, Path
 
-LARGEST = 1e75
+LARGEST_NUMBER = 1e75
 """The largest size of a number in a problem, and the largest growth of a state until the horizon.
 
 Up to four such numbers are multiplied where a problem is scaled. Their product is a finite double; the product of ten
@@ -22,7 +22,7 @@ KEYS = {"initial_set": "initial_state", "stop": "to", "start": "from"}
 
 
 def require_representable(problem: OptimalControlProblem) -> None:
-    """Raise `InputError` for a problem with a number larger than `LARGEST`, or a state that grows by more.
+    """Raise `InputError` for a problem with a number larger than `LARGEST_NUMBER`, or a state that grows by more.
 
     The growth is ``e^(a T)`` for a phase of duration ``T``, where ``a`` is the largest real part of an eigenvalue of
     the phase at its `probes`. The growth of a system whose entries depend on the time is not checked.
@@ -52,10 +52,10 @@ def require_representable(problem: OptimalControlProblem) -> None:
             _require_small((*prefix, name), values)
         A = mode.matrices(mode.probes)[0]
         rate = float(np.linalg.eigvals(A).real.max())
-        if rate * (until - last) > np.log(LARGEST):
+        if rate * (until - last) > np.log(LARGEST_NUMBER):
             raise InputError(
                 path=(*prefix, "A"),
-                expected=f"a state that grows by at most {LARGEST:g} until the horizon",
+                expected=f"a state that grows by at most {LARGEST_NUMBER:g} until the horizon",
                 got=f"e^({rate:.4g} * {until - last:.4g}), of an eigenvalue with the real part {rate:.4g}",
             )
         last = until
@@ -76,10 +76,12 @@ def _list_keyed_numbers(problem: OptimalControlProblem) -> Iterator[tuple[Path, 
 
 
 def _require_small(path: Path, value: np.ndarray) -> None:
-    """Raise `InputError` where a finite number of an array is larger than `LARGEST`."""
+    """Raise `InputError` where a finite number of an array is larger than `LARGEST_NUMBER`."""
     size = np.abs(value[np.isfinite(value)])
-    if size.max(initial=0.0) > LARGEST:
-        raise InputError(path=path, expected=f"numbers of at most {LARGEST:g} in size", got=f"{float(size.max()):g}")
+    if size.max(initial=0.0) > LARGEST_NUMBER:
+        raise InputError(
+            path=path, expected=f"numbers of at most {LARGEST_NUMBER:g} in size", got=f"{float(size.max()):g}"
+        )
 
 
 def _list_numbers(record: object, path: Path) -> Iterator[tuple[Path, np.ndarray]]:

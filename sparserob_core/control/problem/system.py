@@ -34,7 +34,8 @@ A horizon is a double of 53 bits, and therefore differs from the exact period by
 own size within a millionth of the period then differs by a tenth of this bound. With a bound that is ten times larger,
 a decimal that is rounded too early would be accepted as the period.
 """
-LOOKS = 65  # times per phase at which sizes are estimated; with ten times fewer a short pericentre is overlooked
+# Times per phase at which sizes are estimated; with ten times fewer a short pericentre is overlooked
+SAMPLED_TIMES_PER_PHASE = 65
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -186,7 +187,7 @@ class System:
             return self.phases
         modes = list[Phase]()
         # Chebyshev points lie closer to the ends: an entry with zeros at evenly spaced times is not taken for 0
-        shares = (1.0 - np.cos(np.linspace(0.0, np.pi, LOOKS))[:, None]) / 2.0
+        shares = (1.0 - np.cos(np.linspace(0.0, np.pi, SAMPLED_TIMES_PER_PHASE))[:, None]) / 2.0
         for phase in self.phases:
             times = phase.begin + (phase.until - phase.begin) * shares
             if self.powers is not None:
@@ -194,7 +195,11 @@ class System:
                 continue
             arguments = self._build_arguments(times)
             A, B, E = phase.matrices(arguments)
-            drifts = list(phase.forced.matrices(arguments)[1][:, :, -1:]) if self.drifts else [None] * LOOKS
+            drifts = (
+                list(phase.forced.matrices(arguments)[1][:, :, -1:])
+                if self.drifts
+                else [None] * SAMPLED_TIMES_PER_PHASE
+            )
             modes += [Phase(a, b, e, c=drift) for a, b, e, drift in zip(A, B, E, drifts, strict=True)]
         return tuple(modes)
 

@@ -16,7 +16,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.expressions.elementary import FUNCTIONS
 from sparserob_core.sip.expressions.expression import ExpressionMatrix, parse_matrix
 
-SAME = 1e-9
+EXPRESSION_ROUNDING = 1e-9
 """The relative difference between a function and its expressions that counts as rounding.
 
 Arithmetic in another order differs by some 1e-15. With 1e-8 a coefficient that was written down wrongly might pass;
@@ -127,9 +127,10 @@ def traced(name: str, function: Callable[..., object], names: Sequence[str], pro
 
 
 def _has_equal_values(written: ExpressionMatrix, function: Callable[..., object], point: Array) -> bool:
-    """Return True where a matrix of expressions agrees with the function at one point ``(nu,)``, up to `SAME`."""
+    """Return True where a matrix of expressions agrees with the function at one point ``(nu,)``, up to
+    `EXPRESSION_ROUNDING`."""
     expected, actual = np.asarray(function(point), dtype=float), np.asarray(written(point), dtype=float)
-    return expected.shape == actual.shape and bool(np.allclose(expected, actual, rtol=SAME, atol=0.0))
+    return expected.shape == actual.shape and bool(np.allclose(expected, actual, rtol=EXPRESSION_ROUNDING, atol=0.0))
 
 
 def _write_refusal(name: str, why: str) -> str:

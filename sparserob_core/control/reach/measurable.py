@@ -30,7 +30,7 @@ from sparserob_core.control.reach.support import (
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response, unique_rows
 from sparserob_core.control.response.time_grid import TimeGrid
-from sparserob_core.control.sets.integrals import HALVINGS, integrated
+from sparserob_core.control.sets.integrals import INTERVAL_HALVINGS, integrated
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -363,7 +363,7 @@ class MeasurableSupport:
             sizes = sizes + size @ np.abs(E)
         with np.errstate(over="ignore"):
             growth = np.exp(speed * lengths) * lengths / (ORDER + 1)
-        operations = ORDER * (A.shape[0] + 4) + A.shape[0] + 4 * E.shape[1] + HALVINGS
+        operations = ORDER * (A.shape[0] + 4) + A.shape[0] + 4 * E.shape[1] + INTERVAL_HALVINGS
         errors = radius * (np.linalg.norm(np.asarray(row @ matrix), axis=1) * growth * np.linalg.norm(E, 2))
         errors = (
             lengths * (errors + radius * rounding(operations) * np.linalg.norm(sizes, axis=1)) * (1.0 + rounding(8))

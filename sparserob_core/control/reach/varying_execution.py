@@ -33,7 +33,7 @@ from sparserob_core.control.reach.varying_motion import (
 )
 from sparserob_core.control.response.response import Propagator, Response, unique_rows
 from sparserob_core.control.response.varying.expansion import Kernel
-from sparserob_core.control.sets.integrals import CUTS, HALVINGS, absolute, integrated
+from sparserob_core.control.sets.integrals import CUTS_PER_INTERVAL, INTERVAL_HALVINGS, absolute, integrated
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.expressions.rounding import rounding
@@ -268,7 +268,10 @@ class VaryingExecution(Execution):
             return self._bound_joint_inputs(self.bound, integrands)
         (count, order, m), sizes = integrands.terms.shape, integrands.sizes
         # a cut rounds every coefficient four times for every order; halves, of half the length each, twice in all
-        errors = integrands.errors + rounding(self.motion.states + (2 + 4 * CUTS) * order + HALVINGS) * sizes
+        errors = (
+            integrands.errors
+            + rounding(self.motion.states + (2 + 4 * CUTS_PER_INTERVAL) * order + INTERVAL_HALVINGS) * sizes
+        )
         bounds = np.zeros((count, m, 2))
         for j, share in enumerate(self.shares):
             members = np.flatnonzero(asked[j])
@@ -281,7 +284,7 @@ class VaryingExecution(Execution):
     def _bound_joint_inputs(self, bound: ConvexSet, integrands: Integrands) -> Array:
         """Return `_bound_errors` for a set of inputs through all columns together, ``(q, 1, 2)``."""
         (count, order, m), sizes = integrands.terms.shape, integrands.sizes @ self.error_radii
-        terms = rounding(self.motion.states + 2 * order + HALVINGS + 2 * m)
+        terms = rounding(self.motion.states + 2 * order + INTERVAL_HALVINGS + 2 * m)
         errors = integrands.errors @ self.error_radii + terms * sizes
         accuracy = np.maximum(ACCURACY * self.motion.grid.pieces * sizes, TINY)
         integrals = integrated(bound, integrands.terms, np.ones(count), accuracy)

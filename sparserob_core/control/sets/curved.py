@@ -14,7 +14,7 @@ from sparserob_core.brief import noun
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Bool, Float, dense, sealed, shaped
 from sparserob_core.sip.convex_set import (
-    HALVINGS,
+    BISECTION_HALVINGS,
     Array,
     Box,
     ConvexSet,
@@ -28,8 +28,10 @@ from sparserob_core.sip.convex_set import (
 )
 
 _SIGN_DIMENSIONS = 10
-STEEP = 1e10  # exponents up to which the rounding of a base changes the power by less than the bounds leave free
-ROOM = 0.999  # relative deviation of a sum of powers, below which the sum is away from 0 in spite of rounding
+# Exponents up to which the rounding of a base changes the power by less than the bounds leave free
+MAX_NORM_EXPONENT = 1e10
+# Relative deviation of a sum of powers, below which the sum is away from 0 in spite of rounding
+MAX_POWER_DEVIATION = 0.999
 
 
 @dataclass(frozen=True, eq=False)
@@ -563,7 +565,7 @@ def _solve_power_equation(z: Array, multiplier: Array, power: float) -> Array:
     q = max(power, 1.0 / power)
     unit = multiplier if power < 1.0 else multiplier ** (-1.0 / q)
     a = np.minimum(z, unit * z ** (1.0 / q))
-    for _ in range(HALVINGS):
+    for _ in range(BISECTION_HALVINGS):
         convex_summand = (a / unit) ** q
         step = ratios((a + convex_summand - z) * a, a + q * convex_summand)
         a = np.maximum(a - step, 0.0)
@@ -671,11 +673,11 @@ def _bound_complex_root(a: Array, b: Array, q: float) -> Array:
     unit = np.where(largest > 0.0, largest, 1.0)
     a, b = np.abs(a) / unit, b / unit
     total, deviation = (a**q).sum(axis=1), (q * b * (a + b) ** (q - 1.0)).sum(axis=1)
-    analytic = deviation < ROOM * total
+    analytic = deviation < MAX_POWER_DEVIATION * total
     if q == 2.0:
         return np.where(analytic, unit[:, 0] * np.sqrt(total + deviation), np.inf)
     away = ((a > b) | (b == 0.0)).all(axis=1)
-    power_bound = np.where(analytic & away & (q < STEEP), (total + deviation) ** (1.0 / q), np.inf)
+    power_bound = np.where(analytic & away & (q < MAX_NORM_EXPONENT), (total + deviation) ** (1.0 / q), np.inf)
     return np.asarray(unit[:, 0] * np.minimum(power_bound, np.where(away, _bound_by_largest(a, b, q), np.inf)))
 
 
@@ -702,7 +704,7 @@ def _bound_by_largest(a: Array, b: Array, q: float) -> Array:
     lower, upper = (np.where(is_largest, end, 0.0).sum(axis=1) for end in (a - b, a + b))
     shares = (a + b) / np.where(lower > 0.0, lower, 1.0)[:, None] * (1.0 + 8.0 * np.finfo(float).eps)
     ratio_sum = np.where(is_largest, 0.0, np.minimum(shares, 1.0) ** q).sum(axis=1)
-    return np.where((lower > 0.0) & (ratio_sum < ROOM), upper * (1.0 + ratio_sum) ** (1.0 / q), np.inf)
+    return np.where((lower > 0.0) & (ratio_sum < MAX_POWER_DEVIATION), upper * (1.0 + ratio_sum) ** (1.0 / q), np.inf)
 
 
 def _compute_norms(vectors: Array, q: float) -> Array:

@@ -17,13 +17,14 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 EPSILON = float(np.finfo(float).eps)
-HALVINGS = 48  # halvings of an interval, after which its contribution is below rounding
+INTERVAL_HALVINGS = 48  # halvings of an interval, after which its contribution is below rounding
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(17)  # with 9 nodes intervals would be halved four times more
 RADIUS = 3.0  # sum of the half-axes of the ellipse: with 2 the error is 1e-9, with 4 each interval is halved once more
 # error bound, relative to M: 3e-15
 ERROR_FACTOR = 64.0 / 15.0 * RADIUS ** (2.0 - 2.0 * NODES.size) / (1.0 - RADIUS**-2.0)
-CUTS = 3  # divisions at sign changes before an interval is halved: a polynomial has one or two of them on a piece
-SECANTS = 10  # steps of the secant method; with half of them a part near a sign change is halved a few times more
+# Divisions at sign changes before an interval is halved: a polynomial has one or two of them on a piece
+CUTS_PER_INTERVAL = 3
+SECANT_STEPS = 10  # steps of the secant method; with half of them a part near a sign change is halved a few times more
 NEAR_END = 1e-9  # share of an interval next to its ends: an interval with a sign change there is halved
 
 
@@ -67,7 +68,7 @@ def curved_integral(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Ar
         NODES[:, None] ** orders,
         [_build_substitution_matrix(orders.size, 0.5, side) for side in (-0.5, 0.5)],
     )
-    for halving in range(HALVINGS + 1):
+    for halving in range(INTERVAL_HALVINGS + 1):
         series = to_series @ terms
         radii = np.einsum("k,lkw->lw", RADIUS ** orders[1:], np.abs(series[:, 1:])) * (1.0 + rounding)
         maxima = bound.continued(series[:, 0], radii)
@@ -79,7 +80,7 @@ def curved_integral(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Ar
         constant, constant_error = bound.support(terms[:, 0]), np.abs(terms[:, 1:]).sum(axis=1) @ reach
         is_better = constant_error < error
         middle, error = np.where(is_better, constant, middle), np.minimum(error, constant_error)
-        is_open = (2.0 * error * lengths > accuracy[owner]) & (error > rounding * sizes) & (halving < HALVINGS)
+        is_open = (2.0 * error * lengths > accuracy[owner]) & (error > rounding * sizes) & (halving < INTERVAL_HALVINGS)
         # every halving rounds all coefficients again
         error = error + rounding * sizes + step_rounding * halving * first_sizes[owner]
         bounds = np.stack([middle - error, middle + error], axis=1) * lengths[:, None]
@@ -138,11 +139,11 @@ def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) 
     total, owner = np.zeros((lengths.size, 2)), np.arange(lengths.size)
     order = terms.shape[1] - 1
     points = np.einsum("kj,ljw->lkw", bezier(order), terms)
-    for halving in range(HALVINGS + 1):
+    for halving in range(INTERVAL_HALVINGS + 1):
         best = bound.support_point(points[:, order // 2])
         low = (points @ best[:, :, None])[..., 0].mean(axis=1) * lengths
         high = bound.support(points).mean(axis=1) * lengths
-        is_open = (high - low > accuracy[owner]) & (halving < HALVINGS)
+        is_open = (high - low > accuracy[owner]) & (halving < INTERVAL_HALVINGS)
         np.add.at(total, owner[~is_open], np.stack([low, high], axis=1)[~is_open])
         points, owner = points[is_open], np.tile(owner[is_open], 2)
         points = _split_polynomials(points, np.full(len(points), 0.5))
@@ -173,14 +174,14 @@ def absolute(terms: Array, accuracy: Array) -> Array:
     total, owner = np.zeros((len(terms), 2)), np.arange(len(terms))
     order = terms.shape[1] - 1
     points, lengths = terms @ bezier(order).T, np.ones(len(terms))
-    for division in range(HALVINGS + 1):
+    for division in range(INTERVAL_HALVINGS + 1):
         low, high = np.abs(points.mean(axis=1)) * lengths, np.abs(points).mean(axis=1) * lengths
-        is_open = (high - low > accuracy[owner]) & (division < HALVINGS)
+        is_open = (high - low > accuracy[owner]) & (division < INTERVAL_HALVINGS)
         np.add.at(total, owner[~is_open], np.stack([low, high], axis=1)[~is_open])
         points, owner, lengths = points[is_open], np.tile(owner[is_open], 2), lengths[is_open]
         if not owner.size:
             break
-        at = _find_sign_changes(points) if division < CUTS else np.full(len(points), 0.5)
+        at = _find_sign_changes(points) if division < CUTS_PER_INTERVAL else np.full(len(points), 0.5)
         points, lengths = _split_polynomials(points, at), np.concatenate([lengths * at, lengths * (1.0 - at)])
     return total
 
@@ -201,7 +202,7 @@ def _find_sign_changes(points: Array) -> Array:
     weights, powers = np.array([comb(order, k) for k in range(order + 1)]) * points, np.arange(order + 1)
     a, b, fa, fb = np.zeros(len(points)), np.ones(len(points)), points[:, 0], points[:, -1]
     crossing, at = fa * fb < 0.0, np.full(len(points), 0.5)
-    for _ in range(SECANTS):
+    for _ in range(SECANT_STEPS):
         with np.errstate(divide="ignore", invalid="ignore"):
             secant = b - fb * (b - a) / (fb - fa)
         at = np.where(crossing & (secant > NEAR_END) & (secant < 1.0 - NEAR_END), secant, 0.5)

@@ -220,7 +220,7 @@ def intersection(sets: Sequence[ConvexSet]) -> ConvexSet | tuple[ConvexSet, ...]
 
 # The relative part of a direction that may lie outside of the span of an oblique cylinder. With a hundredth of it, the
 # rounding of matrix products would make the support function infinite; a hundred times as much would be no rounding.
-ROUNDED = 1e-12
+OUTSIDE_SPAN_SHARE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +275,7 @@ class Cylinder(ConvexSet):
         base, free = (directions[..., : self.base.dimension], directions[..., self.base.dimension :])
         room: Array | float = 0.0
         if self.slopes is not None:
-            free, room = (free - base @ self.slopes, ROUNDED * (np.abs(base) @ np.abs(self.slopes)))
+            free, room = (free - base @ self.slopes, OUTSIDE_SPAN_SHARE * (np.abs(base) @ np.abs(self.slopes)))
         height: Array = np.where((np.abs(free) <= room).all(axis=-1), self.base.support(base), np.inf)
         return height
 

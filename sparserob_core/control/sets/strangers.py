@@ -16,10 +16,10 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 
 # The tolerance relative to the extent of the set, as in the contract of sets. Ten times less would refuse a support
 # function that is computed by iterations. Ten times more would accept larger errors, although a proof asks for 1e-9.
-CLOSE = 1e-7
+SUPPORT_TOLERANCE = 1e-7
 # The modules of the sets of this package; a plugin that is a single file has a module below sparserob_core.experiment.
 OWN = ("sparserob_core.control.", "sparserob_core.sip.")
-DIRECTIONS = 16  # random directions, which are tried with the axes and with the sums of neighbouring directions
+RANDOM_DIRECTIONS = 16  # random directions, which are tried with the axes and with the sums of neighbouring directions
 
 
 def strangers(record: Any) -> Iterator[ConvexSet]:
@@ -66,7 +66,7 @@ def require_consistent(path: str, convex: ConvexSet | None) -> None:
 def _find_contradiction(convex: ConvexSet) -> str:
     """Return the first contradiction of a set in words; empty where none is found."""
     axes = np.eye(convex.dimension)
-    random_directions = np.random.default_rng(5).normal(size=(DIRECTIONS, convex.dimension))
+    random_directions = np.random.default_rng(5).normal(size=(RANDOM_DIRECTIONS, convex.dimension))
     c = np.vstack(
         [
             axes,
@@ -88,7 +88,7 @@ def _find_contradiction(convex: ConvexSet) -> str:
     if points.shape != c.shape or not np.isfinite(points).all():
         return "a support point is no point"
     lengths = np.linalg.norm(c, axis=1)
-    tolerances = CLOSE * lengths * max(float(np.abs(heights).max()), float(np.abs(points).max()))
+    tolerances = SUPPORT_TOLERANCE * lengths * max(float(np.abs(heights).max()), float(np.abs(points).max()))
     values = points @ c.T  # c'x for every support point x and every direction c
     return _describe_first_failure(
         (np.abs(np.diag(values) - heights) > tolerances, c, "it is not attained at its support point"),

@@ -14,11 +14,11 @@ import numpy.typing as npt
 from sparserob_core.brief import noun
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import dense, sealed
-from sparserob_core.sip.convex_set import CLOSED, Array, ConvexSet, chords, continued_by_signs, finite
+from sparserob_core.sip.convex_set import CLOSED_WIDTH_SHARE, Array, ConvexSet, chords, continued_by_signs, finite
 
 MAX_SIDES = 500  # pairs of half-spaces that are listed; a set with more is described by its support function alone
-ROUNDED = 1e-14  # relative rounding error of the sums along a generator
-PARALLEL = 1e-10  # singular value, relative to generators of length 1, below which these do not span a facet
+GENERATOR_ROUNDING = 1e-14  # relative rounding error of the sums along a generator
+DEGENERATE_FACET = 1e-10  # singular value, relative to generators of length 1, below which these do not span a facet
 
 
 @final
@@ -93,7 +93,7 @@ class Zonotope(ConvexSet):
             np.zeros(len(self.generators)),
             np.ones(len(self.generators)),
             centre @ self.generators.T,
-            (spread + ROUNDED * np.abs(centre)) @ sizes,
+            (spread + GENERATOR_ROUNDING * np.abs(centre)) @ sizes,
         )
         return np.asarray(along + (np.abs(centre) + spread) @ np.abs(self.centre))
 
@@ -150,10 +150,10 @@ class Zonotope(ConvexSet):
         d, sizes = self.dimension, np.linalg.norm(self.generators, axis=1)
         generators = self.generators[sizes > 0] / sizes[sizes > 0, None]
         _, values, basis = np.linalg.svd(generators, full_matrices=True)
-        rank = int((values > PARALLEL).sum())
+        rank = int((values > DEGENERATE_FACET).sum())
         if comb(len(generators), max(rank - 1, 0)) > MAX_SIDES:
             return None
-        basis = np.where(np.abs(basis) > ROUNDED, basis, 0.0) if rank < d else np.eye(d)
+        basis = np.where(np.abs(basis) > GENERATOR_ROUNDING, basis, 0.0) if rank < d else np.eye(d)
         within = (
             [normal @ basis[:rank] for normal in self._find_facet_normals(generators @ basis[:rank].T, rank)]
             if rank
@@ -165,7 +165,7 @@ class Zonotope(ConvexSet):
             np.tile(self.width(H), 2),
             np.abs(self.generators).sum(axis=0),
         )
-        room = np.where(widths > CLOSED * (np.abs(H) @ size), 0.0, ROUNDED)
+        room = np.where(widths > CLOSED_WIDTH_SHARE * (np.abs(H) @ size), 0.0, GENERATOR_ROUNDING)
         return H, self.support(H) + room * (np.abs(H) @ (np.abs(self.centre) + size))
 
     @staticmethod
@@ -177,6 +177,6 @@ class Zonotope(ConvexSet):
         normals = []
         for chosen in combinations(generators, d - 1):
             _, values, rows = np.linalg.svd(np.array(chosen).reshape(d - 1, d))
-            if d == 1 or values.min() > PARALLEL:
+            if d == 1 or values.min() > DEGENERATE_FACET:
                 normals.append(rows[-1])
         return normals

@@ -24,17 +24,17 @@ from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.expressions.rounding import rounding
 
-SHORT = 0.5  # norm times length of a step: what is left of the expansion is then 1e-14 of the row
+STEP_NORM = 0.5  # norm times length of a step: what is left of the expansion is then 1e-14 of the row
 BENDING = 7  # terms of the bounds of derivatives; what is left of them is 1e-6 of the row's size in balanced units
-STORAGE_LIMIT = 2**27  # numbers that the rows of all steps take (1 GB)
-ROWS = 2**22  # numbers of rows that are expanded at once (32 MB)
+MAX_STORED_NUMBERS = 2**27  # numbers that the rows of all steps take (1 GB)
+MAX_ROW_NUMBERS = 2**22  # numbers of rows that are expanded at once (32 MB)
 TIME_BITS = 46  # a power of 1/2 of the horizon: a witness loses rounding by it, and 53 bits hold sums of such times
-INWARDS = 1e-12  # of a set without axes, what corners and boundary points may be off: thousands of roundings
+BOUNDARY_ALLOWANCE = 1e-12  # of a set without axes, what corners and boundary points may be off: thousands of roundings
 HALVED = 44  # halvings of a step across a switch: what is left of it is rounding
 MAX_SWITCHES = 4096  # of a set without corners, whose best value changes all the time
 # Roundings of a transition over a step, for each of which the row at the end is off as often as there are steps; a beam
 # of 348 states, whose modes are far from normal, was off by 0.7 of them.
-ROUNDED = 4
+ROUNDINGS_PER_STEP = 4
 FACTORIALS = np.array([float(factorial(j)) for j in range(ORDER + 2)])
 
 
@@ -72,8 +72,8 @@ class Adjoint:
         """
         balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
         speed = float(np.linalg.norm(balanced, 2)) * horizon
-        count = 2 ** max(6, ceil(log2(max(speed, 1e-300) / SHORT)))
-        if not count * A.shape[0] <= STORAGE_LIMIT:
+        count = 2 ** max(6, ceil(log2(max(speed, 1e-300) / STEP_NORM)))
+        if not count * A.shape[0] <= MAX_STORED_NUMBERS:
             raise NotEnclosable(
                 f"its fastest part moves {speed:.2g} times within the horizon, which takes too many steps"
             )
@@ -140,7 +140,7 @@ class Adjoint:
     def rows(self, times: Array) -> Array:
         """``l`` at times ``(k,)``, ``(k, d)``, in the user's units."""
         steps, shares = self.placed(times)
-        values, batch_size = np.empty((times.size, self.A.shape[0])), max(1, ROWS // self.A.shape[0])
+        values, batch_size = np.empty((times.size, self.A.shape[0])), max(1, MAX_ROW_NUMBERS // self.A.shape[0])
         for start in range(0, times.size, batch_size):
             batch = slice(start, start + batch_size)
             row, total = self.nodes[steps[batch]], np.zeros((steps[batch].size, self.A.shape[0]))
@@ -168,7 +168,7 @@ def within(bound: ConvexSet, points: Array) -> Array:
     if bound.is_box:
         return points
     middle = bound.interior_point()
-    return np.asarray(middle + (1.0 - INWARDS) * (points - middle))
+    return np.asarray(middle + (1.0 - BOUNDARY_ALLOWANCE) * (points - middle))
 
 
 def tidy(times: Array, horizon: float) -> Array:
@@ -308,14 +308,14 @@ class WorstRow:
         ball arithmetic.
         """
         steps = self.adjoint.nodes.shape[0]
-        terms = 2 * self.adjoint.A.shape[0] * (ceil(log2(steps)) + 2) + ORDER + 8 + ROUNDED * steps
+        terms = 2 * self.adjoint.A.shape[0] * (ceil(log2(steps)) + 2) + ORDER + 8 + ROUNDINGS_PER_STEP * steps
         size = float((np.abs(self.adjoint.nodes / self.adjoint.units) @ self._state_magnitudes).max())
         size += float((np.abs(self.adjoint.coefficients[:, 0]) @ self._input_magnitudes).sum() * self.adjoint.step)
         size += 0.0 if self.control_terms is None else float(np.abs(self.control_terms[1]).max())
         size += 0.0 if self.moving is None else float(np.abs(self.moving[1]).max())
         norms = np.linalg.norm(self.adjoint.nodes, axis=1)
         inputs = float(np.linalg.norm(self.adjoint.B, axis=0) @ self._input_magnitudes) * self.adjoint.step
-        truncation = (SHORT ** (ORDER + 1)) * np.exp(SHORT) / FACTORIALS[ORDER + 1]
+        truncation = (STEP_NORM ** (ORDER + 1)) * np.exp(STEP_NORM) / FACTORIALS[ORDER + 1]
         truncation *= float(
             norms.max() * np.linalg.norm(self._state_magnitudes / self.adjoint.units) + norms.sum() * inputs
         )

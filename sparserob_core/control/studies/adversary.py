@@ -24,8 +24,8 @@ from sparserob_core.sip.program import OwnUnits, Separation
 if TYPE_CHECKING:
     from sparserob_core.control.feedback.closed_loop import ClosedLoop
 
-PARTS = 4  # equal parts of every piece on which a measurable worst case is looked for
-HALVINGS = 40  # of a part across a switch of the worst disturbance
+PARTS_PER_PIECE = 4  # equal parts of every piece on which a measurable worst case is looked for
+SWITCH_HALVINGS = 40  # of a part across a switch of the worst disturbance
 SIGNAL = 4096  # parts at most; a set without corners has a worst disturbance that is constant nowhere
 LOSS_TOLERANCE = 1e-14  # of the largest integrand times the horizon: what a constant on a part may lose
 
@@ -156,7 +156,7 @@ def worst_signal(
     flow = _build_adjoint(functionals.response, parameter, time, direction)
     starts = np.concatenate(
         [
-            begin + (end - begin) * np.arange(PARTS) / PARTS
+            begin + (end - begin) * np.arange(PARTS_PER_PIECE) / PARTS_PER_PIECE
             for begin, end in pairwise(functionals.response.propagator.marks if grid.varying else grid.breakpoints)
         ]
     )
@@ -309,7 +309,7 @@ def _refine_parts(
     when they are too many."""
     starts, ends = parts
     active = np.arange(starts.size)
-    for _ in range(HALVINGS):
+    for _ in range(SWITCH_HALVINGS):
         loss, size = _measure_loss(bound, flow, starts[active], ends[active])
         allowed = LOSS_TOLERANCE * size * horizon
         middles = (starts[active] + ends[active]) / 2

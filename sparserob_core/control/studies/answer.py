@@ -23,7 +23,7 @@ from sparserob_core.sip.result import Result
 if TYPE_CHECKING:
     from sparserob_core.control.studies.causal import CausalBound
 
-PARAMETERS = 27  # at most, at which the tube of an uncertain system is computed
+MAX_TUBE_PARAMETERS = 27  # at most, at which the tube of an uncertain system is computed
 INSTANTS = 20_000  # functionals that are asked for at once
 
 
@@ -175,8 +175,8 @@ def supports(model: Transcription, theta: Array, times: Array, directions: Array
     if model.feedback is not None:
         return model.feedback.loop.values(theta, times, directions).T
     lattice, _ = model.parameters.lattice()
-    if len(lattice) > PARAMETERS:
-        lattice = lattice[np.unique(np.linspace(0, len(lattice) - 1, PARAMETERS).round().astype(int))]
+    if len(lattice) > MAX_TUBE_PARAMETERS:
+        lattice = lattice[np.unique(np.linspace(0, len(lattice) - 1, MAX_TUBE_PARAMETERS).round().astype(int))]
     rows, all_directions = model.problem.names.corners.everywhere(directions)
     count, largest = len(all_directions) * len(lattice), np.full((len(directions), times.size), -np.inf)
     along, p = np.repeat(all_directions, len(lattice), axis=0), np.tile(lattice, (len(all_directions), 1))

@@ -20,21 +20,21 @@ from sparserob_core.sip.result import Result
 
 Ended: TypeAlias = Literal["settled", "signals", "work", "seconds"]
 
-SHARED = 1.0 - 2.0**-40  # what shares add up to at most: with rounding no more than 1
-INWARDS = 1.0 - 1e-13  # points that must be in a curved set are drawn inwards by rounding
-AT_ONCE = 8  # signals that a round adds
+MAX_SHARE_SUM = 1.0 - 2.0**-40  # what shares add up to at most: with rounding no more than 1
+INWARD_FACTOR = 1.0 - 1e-13  # points that must be in a curved set are drawn inwards by rounding
+SIGNALS_PER_ROUND = 8  # signals that a round adds
 TOWARDS = 0.9  # of the way from the bound to the policy's cost: the budget at which the tree is asked for room
-NONE = 1e-9  # a relaxation below is rounding
+NEGLIGIBLE_RELAXATION = 1e-9  # a relaxation below is rounding
 # Rounds without a better bound, after which more of them are a bonus: where a limit ends these, the search has settled.
-IDLE = 4
+IDLE_ROUNDS = 4
 # Shares of the policy's answers, with which the worst signals are sought after so many rounds without a better bound;
 # the search ends with the last. Policies that cost as little answer differently: with the first share alone one of them
 # led to 0.433 where others led to 0.448, and with another share after every round, or after three, one led to 0.424.
 ANSWERED = (1.0, 1.0, 1.0, 1.0, 0.5, 0.0)
 WORK, EACH, PER = 1e7, 2e6, 3e3  # that a search may do anyway; for each of a run's programs, and for its columns
-CELLS = 2e7  # numbers of one kind about all signals of a tree: 160 MB
-INSIDE = 1  # times sampled within every piece, beside its ends and the times that the policy's bound rests on
-NEARLY = 1e-6  # of a factor, by which the first one that is excluded lies above the largest one that is not
+MAX_TREE_NUMBERS = 2e7  # numbers of one kind about all signals of a tree: 160 MB
+TIMES_PER_PIECE = 1  # times sampled within every piece, beside its ends and the times that the policy's bound rests on
+FACTOR_ALLOWANCE = 1e-6  # of a factor, by which the first one that is excluded lies above the largest one that is not
 
 
 @final
@@ -120,7 +120,7 @@ class CausalLimits:
         """Return whether the search for a tree ends after so many ``idle`` rounds, and record the reason in
         ``ended``."""
         s = tree.sampled
-        signal_limit = CELLS / max(1, s.T.shape[0] * max(s.N.shape[1], s.T.shape[1] * s.T.shape[2]))
+        signal_limit = MAX_TREE_NUMBERS / max(1, s.T.shape[0] * max(s.N.shape[1], s.T.shape[1] * s.T.shape[2]))
         if self.passed():
             self.ended = "seconds"
         elif tree.work > self.work or len(tree.signals) > signal_limit:
@@ -128,7 +128,7 @@ class CausalLimits:
         elif not self.room(tree):
             self.ended = "signals"
         over = self.ended != "settled"
-        if idle >= IDLE and self.ended != "seconds":
+        if idle >= IDLE_ROUNDS and self.ended != "seconds":
             self.ended = "settled"
         return over
 
@@ -168,7 +168,7 @@ class CausalSearch:
 
     def _sample_times(self, one: FlatConstraint, active: Sequence[tuple[str, float, Array | None]]) -> Array:
         points = self.model.response.grid.breakpoints
-        shares = np.arange(1, INSIDE + 1) / (INSIDE + 1)
+        shares = np.arange(1, TIMES_PER_PIECE + 1) / (TIMES_PER_PIECE + 1)
         inner = (points[:-1, None] + np.diff(points)[:, None] * shares).ravel()
         inside = np.concatenate([points, inner])
         own = [at for name, at, _ in active if name == one.name and one.start <= at <= one.stop]
@@ -206,7 +206,7 @@ class CausalSearch:
             if better is None:  # nothing is feasible, or the solver did not finish
                 refused = self._prove_infeasibility(tree)
                 return (tree, best, False) if refused is None else (tree, refused, True)
-            idle = 0 if better.value > best.value + NONE * abs(better.value) else idle + 1
+            idle = 0 if better.value > best.value + NEGLIGIBLE_RELAXATION * abs(better.value) else idle + 1
             best = better
         if best is not None:
             return tree, best, False
@@ -216,7 +216,7 @@ class CausalSearch:
     @staticmethod
     def _prove_infeasibility(tree: Tree) -> Grown | None:
         multipliers = tree.relaxed()
-        return multipliers if multipliers is not None and multipliers.value > NONE else None
+        return multipliers if multipliers is not None and multipliers.value > NEGLIGIBLE_RELAXATION else None
 
     def largest_factor(self, highest: float, limits: CausalLimits) -> tuple[Tree, Grown] | None:
         """The largest factor of all deviations for which the tree is feasible, with its multipliers."""
@@ -228,7 +228,7 @@ class CausalSearch:
             better = tree.least()
             if better is None:
                 break
-            idle = 0 if better.value < best.value * (1.0 - NEARLY) else idle + 1
+            idle = 0 if better.value < best.value * (1.0 - FACTOR_ALLOWANCE) else idle + 1
             best = better
         return None if best is None else (tree, best)
 
@@ -253,12 +253,12 @@ class CausalSearch:
         """
         effects = None if self.decision is None else share * self.loop.effects(self.decision)
         own = np.einsum("rmk,smk->sr", self.sampled.T, centre.u) - self.sampled.b
-        scale = 1.0 if tree.priced else max(centre.x[0], NONE)
+        scale = 1.0 if tree.priced else max(centre.x[0], NEGLIGIBLE_RELAXATION)
         answered = None if effects is None else np.einsum("rmk,kmq->rq", self.sampled.T, effects)
         departures, z = set[tuple[int, int]](), np.array(tree.signals)
         tree.work += z.shape[0] * (self.sampled.N.size + self.sampled.T.size)
         for signal, report, child in tree.knowledge.leaving(z, own, answered, scale, tree.units):
-            if len(departures) >= min(AT_ONCE, limit):
+            if len(departures) >= min(SIGNALS_PER_ROUND, limit):
                 break
             if (signal, report) not in departures and tree.add(child):
                 departures.add((signal, report))
@@ -290,7 +290,7 @@ class CausalSearch:
         for signal in np.flatnonzero(found.shares).tolist() if np.isfinite(lower) else ():
             index = number(tree.signals[signal])
             weights[index] = weights.get(index, 0.0) + float(found.shares[signal])
-        total = max(1.0, sum(weights.values())) / SHARED
+        total = max(1.0, sum(weights.values())) / MAX_SHARE_SUM
         shares = tuple(weights.get(index, 0.0) / total for index in range(len(deviations)) if weights)
         signals = tuple(_place_in_set(z, disturbance, self.starts.size) for z in deviations)
         return CausalBound(lower, signals, tuple(rows), ended, shares)
@@ -305,5 +305,5 @@ def _place_in_set(z: Array, disturbance: ConvexSet | None, blocks: int) -> Array
         box = disturbance.bounding_box()
         values = np.clip(middle + deviations, box.lower, box.upper)
     else:
-        values = middle + INWARDS * deviations
+        values = middle + INWARD_FACTOR * deviations
     return np.asarray(np.where(deviations == 0.0, middle, values).T)

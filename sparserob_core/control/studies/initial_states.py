@@ -19,7 +19,7 @@ from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.transcription.own_units import fixed
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.control.transcription.rounding import SHARE, added_up, rounded_down
+from sparserob_core.control.transcription.rounding import ROW_ROUNDING, added_up, rounded_down
 from sparserob_core.control.transcription.transcribe import from_state
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
@@ -35,7 +35,7 @@ from sparserob_core.sip.program import (
 )
 from sparserob_core.sip.result import Result
 
-PROGRAMS_KEPT = 4  # ordinary programs, each at one initial state, that are remembered
+START_PROGRAMS_KEPT = 4  # ordinary programs, each at one initial state, that are remembered
 
 
 @final
@@ -78,7 +78,7 @@ class InitialPlane:
         if key not in self._programs:
             program = from_state(self.centred, self._build_initial_state(z)).program
             A, b = self._build_equalities(z)
-            remember(self._programs, key, replace(program, A=A, b=b), PROGRAMS_KEPT)
+            remember(self._programs, key, replace(program, A=A, b=b), START_PROGRAMS_KEPT)
         return self._programs[key]
 
     def rounded(self, z: Array, result: Result) -> Result:
@@ -123,7 +123,7 @@ class InitialPlane:
             return np.zeros(times.size)
         columns = response.weights(times, directions, parameters).free[:, list(self.states)] * self.radius
         sizes = added_up(self.centred, times, directions, parameters) + np.abs(columns).sum(axis=1)
-        return np.asarray((SHARE + response.propagator.slack) * sizes + np.abs(directions) @ self.beyond)
+        return np.asarray((ROW_ROUNDING + response.propagator.slack) * sizes + np.abs(directions) @ self.beyond)
 
     def _bound_row_error(self, cut: Cut) -> float:
         """Return the error bound of a row that holds with equality, under feedback; 0 for other rows, which are wider

@@ -26,7 +26,7 @@ KNOTS = 6  # a slow disturbance is linear between at most so many extreme points
 BASES = 48  # random worst cases that neighbours are made of, beside the adversaries
 FLIPPED = 5  # pieces of a worst case that a neighbour changes, at most
 MIXED = 0.2  # where a disturbance has too few blocks to flip: how far it is drawn towards an extreme point, at most
-NEAR = 0.1  # how far the parameter of a neighbour is drawn towards a random one, at most
+NEIGHBOUR_DISTANCE = 0.1  # how far the parameter of a neighbour is drawn towards a random one, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ class Uncertainty:
         bases, count = self._bases, base.size
         parameters = bases[2][base]
         if self.parameters.set is not None:
-            share = rng.uniform(0.0, NEAR, size=(count, 1))
+            share = rng.uniform(0.0, NEIGHBOUR_DISTANCE, size=(count, 1))
             parameters = parameters + share * (self.parameters.set.sample(count, rng) - parameters)
         model = self.functionals.disturbance
         if model is None:
@@ -230,7 +230,7 @@ class ParametersInTime:
         if directions is None:
             return rows
         corner_rows = np.stack([self.find_corner(direction) for direction in directions])
-        return np.asarray(corner_rows + rng.uniform(0.0, NEAR, size=(count, 1, 1)) * (rows - corner_rows))
+        return np.asarray(corner_rows + rng.uniform(0.0, NEIGHBOUR_DISTANCE, size=(count, 1, 1)) * (rows - corner_rows))
 
     def find_corner(self, direction: Array) -> Array:
         """Return the corner, as rows ``(d, size)``, that belongs to a ``direction (size or more,)`` on all states; any

@@ -12,8 +12,8 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 
 AXES = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-PARALLEL = 1e-9  # sine of an angle between directions that are one
-THIN = 1e-12  # of the box, a distance that is rounding
+SAME_DIRECTION_SINE = 1e-9  # sine of an angle between directions that are one
+SAME_POINT_SHARE = 1e-12  # of the box, a distance that is rounding
 
 
 @final
@@ -74,7 +74,7 @@ def inner_polygon(supports: Sequence[SupportBound]) -> Array:
 def outer_polygon(supports: Sequence[SupportBound]) -> Array:
     """The intersection of the half-planes, its vertices ``(k, 2)`` anticlockwise; the four axis directions must be
     among them."""
-    axes = [min(s.bound for s in supports if float(s.direction @ axis) > 1.0 - PARALLEL) for axis in AXES]
+    axes = [min(s.bound for s in supports if float(s.direction @ axis) > 1.0 - SAME_DIRECTION_SINE) for axis in AXES]
     polygon = np.array([[axes[0], -axes[3]], [axes[0], axes[1]], [-axes[2], axes[1]], [-axes[2], -axes[3]]])
     for support in supports:
         polygon = _clip_polygon(polygon, support.direction, support.bound)
@@ -115,7 +115,7 @@ def _measure_wedge(one: SupportBound, other: SupportBound) -> tuple[float, Array
     if one.point is None or other.point is None:
         return 0.0, None
     sine = _cross(one.direction, other.direction)
-    if sine < PARALLEL:
+    if sine < SAME_DIRECTION_SINE:
         return 0.0, None
     corner = (
         np.array(
@@ -128,8 +128,10 @@ def _measure_wedge(one: SupportBound, other: SupportBound) -> tuple[float, Array
     )
     chord = other.point - one.point
     length = float(np.linalg.norm(chord))
-    normal = np.array([chord[1], -chord[0]]) / length if length > THIN else _compute_bisector(one, other)
-    within = _cross(one.direction, normal) > PARALLEL and _cross(normal, other.direction) > PARALLEL
+    normal = np.array([chord[1], -chord[0]]) / length if length > SAME_POINT_SHARE else _compute_bisector(one, other)
+    within = (
+        _cross(one.direction, normal) > SAME_DIRECTION_SINE and _cross(normal, other.direction) > SAME_DIRECTION_SINE
+    )
     area = abs(_cross(corner - one.point, chord)) / 2
     return (area, normal) if within else (0.0, None)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from scipy.linalg import matrix_balance
 
-from sparserob_core.control.constraints.flat import INSIDE, MAX_INSIDE, SMOOTH
+from sparserob_core.control.constraints.flat import INSIDE, MAX_INSIDE, MAX_SPACING_NORM
 from sparserob_core.control.enclosures.decoupling import decoupled, pace
 from sparserob_core.control.enclosures.flows import Flows
 from sparserob_core.control.enclosures.matrix_exponential import transitions
@@ -20,8 +20,9 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from sparserob_core.control.reach.execution import Execution
 
-MANY = 10_000  # pieces, from which no times inside are looked at where the system hardly moves on one
-HELD = 2_000_000  # numbers of signals, or of transition matrices, that are held at once
+# Pieces, from which no times inside are looked at where the system hardly moves on one
+BREAKPOINTS_ONLY_PIECES = 10_000
+MAX_NUMBERS_AT_ONCE = 2_000_000  # numbers of signals, or of transition matrices, that are held at once
 
 
 def times_inside(times: Array, breakpoints: Array) -> int:
@@ -38,8 +39,8 @@ def fine_times(response: Response, parameters: ParameterIndex, more: Array) -> A
     points = parameters.lattice()[0]
     matrices = np.concatenate([mode.matrices(points)[0] for mode in response.system.modes])
     rate = max(pace(A) for A in np.unique(matrices, axis=0))
-    fewest = INSIDE + 1 if grid.pieces < MANY else 1
-    counts = np.clip(np.ceil(rate * grid.lengths / SMOOTH), fewest, MAX_INSIDE).astype(int)
+    fewest = INSIDE + 1 if grid.pieces < BREAKPOINTS_ONLY_PIECES else 1
+    counts = np.clip(np.ceil(rate * grid.lengths / MAX_SPACING_NORM), fewest, MAX_INSIDE).astype(int)
     index = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     inside = np.repeat(grid.breakpoints[:-1], counts) + np.repeat(grid.lengths, counts) * index / np.repeat(
         counts, counts
@@ -108,7 +109,7 @@ def _choose_motion(response: Response, parameters: Array) -> PieceMotion:
     grid, system = response.grid, response.system
     if grid.varying:
         return _TimeVaryingMotion(response, parameters)
-    is_large = grid.distinct(grid.lengths)[0].size * 4 * system.states**2 > HELD
+    is_large = grid.distinct(grid.lengths)[0].size * 4 * system.states**2 > MAX_NUMBERS_AT_ONCE
     if is_large and not parameters.shape[1] and grid.mode is None:
         return _DecoupledMotion(response)
     return _MatrixMotion(response, parameters)
@@ -214,9 +215,9 @@ def worst_errors(response: Response, execution: Execution, command: Array, at: t
 def trajectories_at_once(response: Response, uncertain: bool) -> int:
     """Return the number of trajectories that are held in memory together, between 16 and 4096."""
     grid, system = response.grid, response.system
-    signals = HELD // (max(1, system.disturbances) * (int(grid.disturbance_piece.max()) + 1))
+    signals = MAX_NUMBERS_AT_ONCE // (max(1, system.disturbances) * (int(grid.disturbance_piece.max()) + 1))
     kinds = grid.pieces if grid.varying else grid.distinct(grid.lengths)[0].size
-    flows = HELD // (kinds * 4 * system.states**2) if uncertain else signals
+    flows = MAX_NUMBERS_AT_ONCE // (kinds * 4 * system.states**2) if uncertain else signals
     return int(np.clip(min(signals, flows), 16, 4096))
 
 

@@ -32,13 +32,14 @@ from sparserob_core.sip.proof.branch_and_bound import Supremum, supremum
 Sense: TypeAlias = Literal["sup", "inf"]
 
 OUTPUT, STATE = "output", "state"  # what rows are called that no constraint asks for
-LEAST = 1e-3  # of the largest value of a row that is met: the enclosure of one that is near 0 is as wide as one of that
-NOTHING = 1e-12  # of a row's unit: one that is nowhere larger is 0 but for rounding, and is enclosed to its unit
-LOOKS = 65  # times at which values of a row are looked at first
+# Of the largest value of a row that is met: the enclosure of one that is near 0 is as wide as one of that
+MIN_ROW_SHARE = 1e-3
+ZERO_ROW_SHARE = 1e-12  # of a row's unit: one that is nowhere larger is 0 but for rounding, and is enclosed to its unit
+FIRST_SAMPLED_TIMES = 65  # times at which values of a row are looked at first
 BINS = 240  # equal parts of a window, on each of which both sides are told: the width of a figure in half points
-TERMS = 4  # of a row, at most, that are spelt out
-ROUNDING_SHARE = 2e-11  # of a row's largest value, by which both sides are reported wider: a checker rounds as well
-SUMMED = 2e-12  # of the terms that make it, which are more where they cancel: rounding was a twentieth of that
+MAX_SPELT_TERMS = 4  # of a row, at most, that are spelt out
+WIDENING_SHARE = 2e-11  # of a row's largest value, by which both sides are reported wider: a checker rounds as well
+TERMS_ROUNDING = 2e-12  # of the terms that make it, which are more where they cancel: rounding was a twentieth of that
 
 
 @final
@@ -74,7 +75,7 @@ class Row:
         the time add is told by `Corners.at`."""
         d, names = problem.system.states, problem.names
         used = np.flatnonzero(names.corners.without(self.direction)).tolist()
-        if len(used) > TERMS:
+        if len(used) > MAX_SPELT_TERMS:
             return f"a combination of {len(used)} states"
         text = ""
         for i in used:
@@ -167,9 +168,9 @@ def bound_row(
     notify: Notify = ignore,
     deadline: Deadline | None = None,
 ) -> BoundedRow:
-    """Enclose the worst case of a row at the control ``theta (m, N)``, to a ``tolerance`` relative to it, or to `LEAST`
-    of the largest value that the row has anywhere in its window, or of its unit where that is 0 but for rounding.
-    Dictionaries are those of control and disturbance."""
+    """Enclose the worst case of a row at the control ``theta (m, N)``, to a ``tolerance`` relative to it, or to
+    `MIN_ROW_SHARE` of the largest value that the row has anywhere in its window, or of its unit where that is 0 but for
+    rounding. Dictionaries are those of control and disturbance."""
     worst = followed(problem, dictionaries, theta, row)
     if worst is not None:
         return _bound_known_row(worst, row, tolerance, notify, deadline)
@@ -232,16 +233,18 @@ def _bound_known_row(
         ),
         cells=(cells[0][:, None], cells[1][:, None]),
     )
-    times = np.linspace(row.start, row.stop, LOOKS)
+    times = np.linspace(row.start, row.stop, FIRST_SAMPLED_TIMES)
     samples = worst.at(times)[0]
-    bounds = supremum(family, np.zeros(1), tolerance, LEAST * float(np.abs(samples).max()), notify, deadline=deadline)
+    bounds = supremum(
+        family, np.zeros(1), tolerance, MIN_ROW_SHARE * float(np.abs(samples).max()), notify, deadline=deadline
+    )
     # cells are probed in their middles, and what grows until the end of its window is largest there
     best = float(times[samples.argmax()]) if samples.max() > bounds.lower else float(bounds.index[0])
     tidied = float(tidy(np.array([best]), float(worst.grid[-1]))[0])
     time = tidied if row.start <= tidied <= row.stop else best
     state, changes, disturbance = worst.witness(time)
     edges, middles = _divide_window(row)
-    rounding_error = ROUNDING_SHARE * max(float(np.abs(samples).max()), abs(bounds.lower)) + worst.error_bound
+    rounding_error = WIDENING_SHARE * max(float(np.abs(samples).max()), abs(bounds.lower)) + worst.error_bound
     return BoundedRow(
         row,
         worst.evaluate(time, state, changes, disturbance) - rounding_error,
@@ -300,14 +303,14 @@ def _bound_by_program(
     family, decision = own.program.families[0], model.functionals.decided_by(theta) / own.decision
     units, unit = np.asarray(family.index_units), family.row_unit(0)
     middle = (family.index_set.lower + family.index_set.upper) / 2
-    times = np.linspace(family.index_set.lower[0], family.index_set.upper[0], LOOKS)
-    samples = family.violations(decision, np.hstack([times[:, None], np.tile(middle[1:], (LOOKS, 1))]))
+    times = np.linspace(family.index_set.lower[0], family.index_set.upper[0], FIRST_SAMPLED_TIMES)
+    samples = family.violations(decision, np.hstack([times[:, None], np.tile(middle[1:], (FIRST_SAMPLED_TIMES, 1))]))
     parameter = model.parameters.clamp((middle * units)[None, 1:])
     magnitude = _sum_magnitudes(model.functionals, theta, row.direction[:d], times * units[0], parameter)
     largest = float(np.abs(samples).max())
-    size = largest if max(largest, magnitude / unit) > NOTHING else 1.0
+    size = largest if max(largest, magnitude / unit) > ZERO_ROW_SHARE else 1.0
     try:
-        bounds = supremum(family, decision, tolerance, LEAST * size, notify, deadline=deadline)
+        bounds = supremum(family, decision, tolerance, MIN_ROW_SHARE * size, notify, deadline=deadline)
     except NotEnclosable as error:
         index = np.append(times[samples[:, 0].argmax()], middle[1:])
         leaves = (family.index_set.lower[None], family.index_set.upper[None], np.full(1, np.inf))
@@ -330,7 +333,7 @@ def _bound_by_program(
     for p in (bounds.index[1:], middle[1:]):
         indices = np.hstack([(middles / units[0])[:, None], np.tile(p, (middles.size, 1))])
         low = np.maximum(low, family.violations(decision, indices)[:, 0] if middles.size else low)
-    rounding_error = max(ROUNDING_SHARE * max(size, abs(bounds.lower)), SUMMED * magnitude / unit)
+    rounding_error = max(WIDENING_SHARE * max(size, abs(bounds.lower)), TERMS_ROUNDING * magnitude / unit)
     own_edges = edges / units[0]
     return BoundedRow(
         row,

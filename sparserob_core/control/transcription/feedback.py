@@ -42,11 +42,11 @@ from sparserob_core.sip.program import Formulation
 PEAK, EFFORT = "peak", "effort"  # names of the families that are about the control
 # Largest effect on a row, relative to its size, of an entry of the deviations that no gain answers. With a thousandth,
 # programs with sets of 1e-12 fail; with ten times as much, costs are off by more than decision 0088 excuses.
-STILL = 1e-9
+NEGLIGIBLE_EFFECT = 1e-9
 # Least deviation of an entry, in its unit, whose effects are variables in this unit; those of smaller ones are
 # rescaled, since they would be numbers of 1e8 beside others of 1. With a millionth of it programs of initial states
 # that deviate by 1e-8 fail.
-SMALL = 2.0**-10
+LEAST_DEVIATION = 2.0**-10
 FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: it is met to `EQUALITY` of them
 
 
@@ -267,7 +267,7 @@ def _build_measurements(
         answers(spread.within(innovations), mask, problem.system.controls, innovations),
         fixed(problem),
     )
-    is_small = (spread.radii > 0.0) & (spread.radii < SMALL)
+    is_small = (spread.radii > 0.0) & (spread.radii < LEAST_DEVIATION)
     coordinates = coordinates.on(power_of_two(np.where(is_small, spread.radii, 1.0)))
     equality_units = FINER * power_of_two(np.maximum(added_up(problem, own.functionals), np.abs(h)))
     ends = _split_equalities(H / equality_units[:, None], h / equality_units)
@@ -442,7 +442,7 @@ def _collect_deviations(posed: Posed, still: np.ndarray | None) -> Spread:
 
 def _find_ineffective_entries(own: Posed, spread: Spread) -> np.ndarray:
     """Return a mask ``(Q,)`` of the entries of the disturbance and of the initial state that move no row by more than
-    `STILL` of its size (decision 0088). Gains on such entries would be unbounded.
+    `NEGLIGIBLE_EFFECT` of its size (decision 0088). Gains on such entries would be unbounded.
 
     The entries of one coordinate of a box, at all times, are in the mask together or not at all; of any other set, all
     its entries. Entries of the noise are never in it. With fixed final states nothing is, since these hold at every
@@ -456,7 +456,9 @@ def _find_ineffective_entries(own: Posed, spread: Spread) -> np.ndarray:
         np.zeros(0) if convex is None else convex.width(np.eye(convex.dimension)) for convex in sets
     )
     rows = _normalise_rows(own.constraints, own.problem.system.states)
-    is_negligible = find_negligible_entries(own.response, model, disturbance_widths, initial_widths, rows, STILL)
+    is_negligible = find_negligible_entries(
+        own.response, model, disturbance_widths, initial_widths, rows, NEGLIGIBLE_EFFECT
+    )
     if bound is not None and model is not None:
         entries = _combine_over_times(bound, is_negligible[: is_negligible.size - initial_widths.size])
         is_still[: is_negligible.size - initial_widths.size] = np.tile(entries, model.block_count)

@@ -16,19 +16,20 @@ from sparserob_core.control.response.reference import MovingReference
 from sparserob_core.control.sets.directions import sampled
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
-TIMES = 17  # at most, at which a reach is looked at
-AT_ONCE = 2_000_000  # numbers that functionals are made of
-LOOKED_AT = 1000  # pieces, in about so many of which a reach is computed
-PARAMETERS = 9  # at most, at which a reach is looked at: the middle and ends of axes; the diagonal adds two
-RESOLVED = 2.0**-18  # of the numbers that are added up, the least unit: 1e-9 of it is 17 units of rounding
+MAX_SAMPLED_TIMES = 17  # at most, at which a reach is looked at
+MAX_FUNCTIONAL_NUMBERS = 2_000_000  # numbers that functionals are made of
+SAMPLED_PIECES = 1000  # pieces, in about so many of which a reach is computed
+MAX_SAMPLED_PARAMETERS = 9  # at most, at which a reach is looked at: the middle and ends of axes; the diagonal adds two
+LEAST_UNIT_SHARE = 2.0**-18  # of the numbers that are added up, the least unit: 1e-9 of it is 17 units of rounding
 # Of the numbers that are added up: a set that is thinner holds no point that a solver of doubles finds, and counts as a
 # point there. With a thousandth of it, balls of radius 1e-12 end undecided; with a thousand times as much, sets that
-# are kept now would be excused more than their width. The checker's `THIN` is larger, so that it calls thin what is.
-THIN = 2.0**-37
+# are kept now would be excused more than their width. The checker's `THIN` is larger, so that it calls thin
+# what is.
+THIN_SET_SHARE = 2.0**-37
 # Of how far a row of such a set reaches, its unit: a search leaves half a billionth of the unit, a claim may excuse a
 # billionth of what the row does, which is less than it could. A tenth of it is what solvers are off by; with ten times
 # as much, sets end undecided whose row does a tenth of what it could.
-POINT = 2.0**-4
+POINT_UNIT_SHARE = 2.0**-4
 COST = 0.125  # of the largest possible cost, its unit: weights of a regulariser keep their size in the paper's problems
 CHAINED = 1e150  # a state that a chain of couplings might bring beyond this is left to the response
 
@@ -72,7 +73,7 @@ def own_units(problem: OptimalControlProblem, rough: Units, functionals: WorstFu
     """Return the units of a problem, from the largest distance of its states from 0. ``functionals`` and the set of the
     ``control`` are those of the problem in rough units."""
     axes, parameters = np.eye(problem.system.states), ParameterIndex(functionals.response.system.parameters)
-    functionals = functionals.coarser(LOOKED_AT)
+    functionals = functionals.coarser(SAMPLED_PIECES)
     times = window_times(functionals, 0.0, float(functionals.response.grid.breakpoints[-1]))
     reach, _ = reaches(functionals, parameters, control, axes, times)
     usable = np.isfinite(reach) & (reach > 0.0)
@@ -108,10 +109,10 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     """Return the unit ``(r,)`` of each row of a constraint (`units_of_sides`).
 
     The rows of a curved set are multiples of its gauge. Their unit is 1, or the resolution of double precision where
-    that is larger. For a set that is a point to rounding, the unit is `POINT` times the least reach of the rows in
-    these multiples, at least 1.
+    that is larger. For a set that is a point to rounding, the unit is `POINT_UNIT_SHARE` times the least reach of the
+    rows in these multiples, at least 1.
     """
-    functionals, sides = constraint.functionals.coarser(LOOKED_AT), constraint.sides
+    functionals, sides = constraint.functionals.coarser(SAMPLED_PIECES), constraint.sides
     times = window_times(functionals, constraint.start, constraint.stop)
     reference = constraint.reference
     if sides is not None:
@@ -131,7 +132,9 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     _, directions, _, heights = constraint.functionals_at(indices)
     _, sums = reaches(functionals, constraint.parameters, control, np.eye(directions.shape[1]), times)
     sums = sums + reference.size
-    if (np.abs(directions) @ sums).max() <= 1.0 / RESOLVED:  # a sum along c is at most |c| times those along the axes
+    if (
+        np.abs(directions) @ sums
+    ).max() <= 1.0 / LEAST_UNIT_SHARE:  # a sum along c is at most |c| times those along the axes
         return np.ones(1)
     reach, sums = reaches(functionals, constraint.parameters, control, directions, times)
     sums = sums + reference.reach(directions)
@@ -139,10 +142,10 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
         np.abs(heights).max(),
         np.abs(directions).sum(axis=1).max() * _estimate_uncontrolled_reach(functionals, constraint.parameters),
     )
-    if (THIN * np.minimum(sums, near) > 1.0).all():
+    if (THIN_SET_SHARE * np.minimum(sums, near) > 1.0).all():
         reach = reach + reference.reach(directions)
-        return np.maximum(1.0, power_of_two(np.array([POINT * reach[reach > 0.0].min(initial=sums.max())])))
-    return np.maximum(1.0, power_of_two(np.array([RESOLVED * sums.max()])))
+        return np.maximum(1.0, power_of_two(np.array([POINT_UNIT_SHARE * reach[reach > 0.0].min(initial=sums.max())])))
+    return np.maximum(1.0, power_of_two(np.array([LEAST_UNIT_SHARE * sums.max()])))
 
 
 def shortfall(constraints: Sequence[StateConstraint]) -> float:
@@ -171,18 +174,18 @@ def units_of_sides(H: Array, h: Array, reach: Array, added: Array, driven: Array
     """Return the unit ``(r,)`` of rows ``H x <= h``: the least of ``reach (r,)``, ``|h|`` and the width to the opposite
     row.
 
-    The result is a power of two, 1.2 to 2.5 times below this value. The value is never below `RESOLVED` times the sums
-    ``added (r,)``. Left out are numbers that are 0, and of ``|h|`` and the width those below `THIN` times the smaller
-    one of ``added`` and ``driven (r,)``, the sums without growth and control. For a row whose width is that small, only
-    `POINT` times ``reach`` counts, since nothing is left to keep away from the row.
+    The result is a power of two, 1.2 to 2.5 times below this value. The value is never below `LEAST_UNIT_SHARE` times
+    the sums ``added (r,)``. Left out are numbers that are 0, and of ``|h|`` and the width those below `THIN_SET_SHARE`
+    times the smaller one of ``added`` and ``driven (r,)``, the sums without growth and control. For a row whose width
+    is that small, only `POINT_UNIT_SHARE` times ``reach`` counts, since nothing is left to keep away from the row.
     """
     least_sums = np.minimum(added, driven)
-    across, thin = widths(H, h), np.where(np.isfinite(added), THIN * least_sums, 0.0)
+    across, thin = widths(H, h), np.where(np.isfinite(added), THIN_SET_SHARE * least_sums, 0.0)
     near = np.where(across > thin, np.stack([np.abs(h), across]), 0.0)
-    reach = np.where(across > thin, 1.0, POINT) * reach
+    reach = np.where(across > thin, 1.0, POINT_UNIT_SHARE) * reach
     sizes = np.vstack([reach[None], np.where(near > thin, near, 0.0)])
     sizes = np.where(np.isfinite(sizes) & (sizes > 0.0), sizes, np.inf).min(axis=0)
-    least = np.where(np.isfinite(added), RESOLVED * added, 0.0)
+    least = np.where(np.isfinite(added), LEAST_UNIT_SHARE * added, 0.0)
     unit = np.where(np.isfinite(sizes), np.maximum(sizes, least), np.where(least > 0.0, least, 2.0))
     return power_of_two(unit) / 2.0
 
@@ -237,7 +240,7 @@ def reaches(
     at, p = np.tile(times, shape[0] * r), np.repeat(points, r * times.size, axis=0)
     directions = np.tile(np.repeat(H, times.size, axis=0), (shape[0], 1))
     up, down, magnitudes = (np.zeros(at.size) for _ in range(3))
-    size = max(1, AT_ONCE // functionals.response.numbers(p.shape[1]))
+    size = max(1, MAX_FUNCTIONAL_NUMBERS // functionals.response.numbers(p.shape[1]))
     for begin in range(0, at.size, size):
         batch = slice(begin, begin + size)
         free, on_inputs, on_noise = functionals.response.weights(at[batch], directions[batch], p[batch])
@@ -313,7 +316,7 @@ def looked_at(parameters: ParameterIndex) -> Array:
     """Return a middle parameter, and support points along the axes and the diagonal, ``(v, nu)``."""
     if parameters.set is None:
         return np.zeros((1, 0))
-    axes = np.eye(parameters.count)[: (PARAMETERS - 1) // 2]
+    axes = np.eye(parameters.count)[: (MAX_SAMPLED_PARAMETERS - 1) // 2]
     points = parameters.set.support_point(np.vstack([axes, -axes]))
     corners = np.ones((1, parameters.count))
     outer = parameters.set.support_point(np.vstack([corners, -corners]))
@@ -329,7 +332,7 @@ def window_times(functionals: WorstFunctionals, start: float, stop: float) -> Ar
     """Return the ends of a window and some breakpoints between them."""
     breaks = functionals.response.grid.breakpoints
     inside = breaks[(breaks > start) & (breaks < stop)]
-    chosen = np.unique(np.linspace(0, inside.size - 1, min(inside.size, TIMES - 2)).round().astype(int))
+    chosen = np.unique(np.linspace(0, inside.size - 1, min(inside.size, MAX_SAMPLED_TIMES - 2)).round().astype(int))
     return np.unique(np.concatenate([[start], inside[chosen] if inside.size else inside, [stop]]))
 
 

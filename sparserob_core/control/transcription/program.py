@@ -24,7 +24,7 @@ from sparserob_core.control.response.inner_loop import InnerLoop
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.transcription.objective import objective, quadratics
 from sparserob_core.control.transcription.own_units import (
-    RESOLVED,
+    LEAST_UNIT_SHARE,
     added_up,
     extent,
     fixed,
@@ -40,9 +40,9 @@ from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.expressions.taylor import TaylorSpace
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, EqualityErrors, Formulation, SemiInfiniteProgram
 
-SAME = 1e-11  # of the numbers that are added up, a difference that is rounding
+DIFFERENCE_ROUNDING = 1e-11  # of the numbers that are added up, a difference that is rounding
 EQUALS = "equals"  # the name of the fixed final states
-IDLE = 1e-15  # of the numbers that are added up, an entry of a row that is rounding
+NEGLIGIBLE_ROW_ENTRY = 1e-15  # of the numbers that are added up, an entry of a row that is rounding
 
 
 @final
@@ -208,11 +208,11 @@ def held_units(posed: Posed, ranged: ConvexSet) -> RowUnits:
     sums = added_up(replace(posed.held, control=ranged), posed.functionals)
     is_controlled = (
         np.abs(_build_equalities(posed.held, posed.functionals, posed.parameters)[0]).max(axis=1, initial=0.0)
-        > IDLE * sums
+        > NEGLIGIBLE_ROW_ENTRY * sums
     )
     H, h = slanted(ranged)
     sides = units_of_sides(H, h, ranged.reach(H), np.abs(H) @ extent(ranged)) if h.size else h
-    ends = power_of_two(np.where(is_controlled, 1.0, RESOLVED) * sums)
+    ends = power_of_two(np.where(is_controlled, 1.0, LEAST_UNIT_SHARE) * sums)
     return RowUnits(sides, _step_units(posed.held, ranged), ends, is_controlled)
 
 
@@ -332,7 +332,7 @@ def _build_equalities(
         G, offset = functionals.rows(time, up[None], middle)
         sigma = functionals.offsets(time, up[None], middle) + functionals.offsets(time, -up[None], middle)
         state = int(np.flatnonzero(up)[0])
-        if sigma[0] > SAME * size or _is_uncertain_state(problem, parameters, state):
+        if sigma[0] > DIFFERENCE_ROUNDING * size or _is_uncertain_state(problem, parameters, state):
             raise InputError(
                 f"terminal: equals: state {state + 1} depends on the uncertainty, so no control can fix its final"
                 f" value to {value:g}; expected a set with interior"

@@ -19,8 +19,9 @@ from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.expressions.taylor import TaylorSpace
 from sparserob_core.sip.result import Result
 
-SECONDS = 30.0  # that the search takes for a problem that cannot be proven, unless a limit is given: for a witness
-TINY = 1e-6  # of the parameters: a cell on which a system that can be enclosed at all will be
+# That the search takes for a problem that cannot be proven, unless a limit is given: for a witness
+UNPROVABLE_SECONDS = 30.0
+PROBED_CELL_SHARE = 1e-6  # of the parameters: a cell on which a system that can be enclosed at all will be
 
 
 def unprovable(problem: OptimalControlProblem) -> str | None:
@@ -49,7 +50,7 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
     try:
         space = TaylorSpace(problem.system.parameter_count, 1)
         for mode in problem.system.forced.modes:
-            mode.taylor(space, parameters.interior_point(), TINY * (box.upper - box.lower) / 2)
+            mode.taylor(space, parameters.interior_point(), PROBED_CELL_SHARE * (box.upper - box.lower) / 2)
     except NotEnclosable as error:
         return str(error)
     return None
@@ -57,7 +58,11 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
 
 def announced(why: str, limited: bool) -> str:
     """Return the message at the beginning of a run that cannot end with a certificate."""
-    ends = "" if limited else f"; the search for a witness ends after {SECONDS:g} s, unless limits.seconds is given"
+    ends = (
+        ""
+        if limited
+        else f"; the search for a witness ends after {UNPROVABLE_SECONDS:g} s, unless limits.seconds is given"
+    )
     return f"{why}{ends}"
 
 

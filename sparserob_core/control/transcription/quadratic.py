@@ -25,8 +25,9 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
 COUPLING_LIMIT = 5000  # values of a control that may be coupled: a matrix of their square
-POINTS = 16  # of Gauss' rule, on times on which the norm of A is at most 2: half of them leave a millionth of a digit
-SHORT = 0.5  # the norm of F h up to which W is read off one exponential
+# Of Gauss' rule, on times on which the norm of A is at most 2: half of them leave a millionth of a digit
+GAUSS_POINTS = 16
+MAX_EXPONENT_NORM = 0.5  # the norm of F h up to which W is read off one exponential
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +156,7 @@ def _integrate_varying(
         transitions[~decided, :d, d + 1 :] = 0.0
         return transitions
 
-    points, shares = np.polynomial.legendre.leggauss(POINTS)
+    points, shares = np.polynomial.legendre.leggauss(GAUSS_POINTS)
     half = np.diff(propagator.marks)[:, None] / 2
     times = (propagator.marks[:-1, None] + half * (1.0 + points)).ravel()
     pieces, weights = grid.locate(times), np.zeros((grid.pieces, *M.shape))
@@ -225,7 +226,7 @@ def _condense_state_cost(pieces: NominalPieces, m: int, size: int) -> tuple[Arra
 def _integrate_weight(F: Array, M: Array, length: float) -> tuple[Array, Array]:
     """Return ``e^{F h}`` and ``int_0^h e^{F't} M e^{Ft} dt``."""
     size = F.shape[0]
-    doublings = max(0, int(np.ceil(np.log2(max(np.abs(F).sum(axis=0).max() * length / SHORT, 1e-300)))))
+    doublings = max(0, int(np.ceil(np.log2(max(np.abs(F).sum(axis=0).max() * length / MAX_EXPONENT_NORM, 1e-300)))))
     short = length / 2.0**doublings
     block = np.zeros((2 * size, 2 * size))
     block[:size, :size], block[:size, size:], block[size:, size:] = -F.T, M, F

@@ -1,7 +1,7 @@
 """Effect of rounding on a lower bound.
 
 An allowance for this effect is subtracted before the bound is reported. A later derivation of the bound from its
-multipliers is then not to find a smaller one. The allowance is a fixed `SHARE` of the numbers that are added up.
+multipliers is then not to find a smaller one. The allowance is a fixed `ROW_ROUNDING` of the numbers that are added up.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.expressions.rounding import EPSILON
 from sparserob_core.sip.result import Result
 
-SHARE = 64 * 2.0**-52  # of the numbers that are added up to a row: products of a few matrices and sums of many terms
+# Of the numbers that are added up to a row: products of a few matrices and sums of many terms
+ROW_ROUNDING = 64 * 2.0**-52
 INTEGRATED = 8.0  # weight of integrals of absolute values: enclosures of them add up many parts of each
 SMALL_GAP = 1e-11  # excess of the gap over its tolerance, after the reduction, that leaves a result certified
 
@@ -31,9 +32,9 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None, 
 
     A row ``c'x(t) <= b`` is a sum of the contributions of the initial state, every piece of the control and every piece
     of the disturbance to ``c'x(t)``. The absolute values of these contributions, at their largest, times the
-    multipliers of the rows and `SHARE`, are the allowance for the rounding of them all (Higham 2002, section 3.1).
-    A piece of the control whose switching function is below its price by more than that contributes 0 to the bound,
-    whatever is rounded (`_sum_control_magnitudes`).
+    multipliers of the rows and `ROW_ROUNDING`, are the allowance for the rounding of them all (Higham 2002, section
+    3.1). A piece of the control whose switching function is below its price by more than that contributes 0 to the
+    bound, whatever is rounded (`_sum_control_magnitudes`).
 
     Further errors are subtracted as well. A multiplier of the wrong sign has an error (`_bound_sign_error`).
     Transitions have a relative error (`_estimate_transition_error`), and the truncation error of a law as a series in
@@ -43,7 +44,7 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None, 
     """
     if not np.isfinite(result.lower_bound) or result.lower_bound <= 0.0:  # without multipliers 0 is exact
         return result
-    share = SHARE + _estimate_transition_error(model)
+    share = ROW_ROUNDING + _estimate_transition_error(model)
     error = share * (
         _sum_row_magnitudes(model, result, share, prices) + _sum_tangent_magnitudes(model, result) + result.lower_bound
     )
@@ -233,7 +234,7 @@ def _bound_sign_error(model: Transcription, result: Result) -> float:
     sides, remaining = np.split(result.dual.z[controls * pieces :], [h.size * pieces])
     error = float(np.maximum(-sides, 0.0).reshape(h.size, pieces).sum(axis=1) @ np.maximum(bound.support(-H), 0.0))
     # of opposite sides of a set without interior multipliers may be as large as they like
-    error += SHARE * float(np.abs(sides).reshape(h.size, pieces).sum(axis=1) @ (np.abs(H) @ extent(bound)))
+    error += ROW_ROUNDING * float(np.abs(sides).reshape(h.size, pieces).sum(axis=1) @ (np.abs(H) @ extent(bound)))
     steps = Steps.of(model.problem, model.control)
     if steps.count:
         own = remaining[: steps.upper.size * steps.times.size]  # what follows bounds sizes from both sides
@@ -243,5 +244,5 @@ def _bound_sign_error(model: Transcription, result: Result) -> float:
         )
         wrong_signs = np.where(np.isfinite(steps.upper), 0.0, np.maximum(step_multipliers, 0.0).sum(axis=1))
         wrong_signs += np.where(np.isfinite(steps.lower), 0.0, np.maximum(-step_multipliers, 0.0).sum(axis=1))
-        error += float((wrong_signs + SHARE * np.abs(step_multipliers).sum(axis=1)) @ magnitudes)
+        error += float((wrong_signs + ROW_ROUNDING * np.abs(step_multipliers).sum(axis=1)) @ magnitudes)
     return error

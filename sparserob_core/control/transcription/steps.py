@@ -18,7 +18,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.expressions.rounding import rounding
 
 MAX_CUTS = 60  # rounds of tangents
-CLOSE = 1e-7  # of the control's range, a point that is as good as inside
+INTERIOR_TOLERANCE = 1e-7  # of the control's range, a point that is as good as inside
 
 
 @final
@@ -158,7 +158,7 @@ def _has_infeasible_tangents(held: list[tuple[ConvexSet, Array, Array]], reach: 
         cuts = []
         for convex, M, offset, at in points:
             flat = convex.halfspaces()
-            outside = np.flatnonzero(convex.violation(at) > CLOSE * (1.0 + np.abs(at).max(initial=0.0)))
+            outside = np.flatnonzero(convex.violation(at) > INTERIOR_TOLERANCE * (1.0 + np.abs(at).max(initial=0.0)))
             for number in outside.tolist():
                 normals = convex.normal(at[[number]]) if flat is None else flat[0]
                 cuts += [(convex, M, offset, number, c) for c in normals]

@@ -26,7 +26,7 @@ from sparserob_core.sip.maximiser import Maximiser, Report
 from sparserob_core.sip.search.search import Rules, maximise
 
 CONFIGS = ("coupled_masses", "experiment1_repaired", "experiment2_repaired")
-DIGITS = 1e-6  # of the maximum: to so many digits the maxima of the standard functions are known
+KNOWN_MAXIMUM_ACCURACY = 1e-6  # of the maximum: to so many digits the maxima of the standard functions are known
 
 
 def benchmark(
@@ -92,7 +92,7 @@ def _build_benchmark(
     targets = []
     for landscape in every:
         median = landscape.begin(0)
-        slack = max(accuracy * (landscape.maximum - median), DIGITS * abs(landscape.maximum))
+        slack = max(accuracy * (landscape.maximum - median), KNOWN_MAXIMUM_ACCURACY * abs(landscape.maximum))
         targets.append(landscape.maximum - slack)
     problems = [
         Instance(landscape.name, landscape.maximum, True, landscape.target.domain.dimension + 1.0)
@@ -135,7 +135,7 @@ def _run_search(
     start = time.process_time()
     report: Report = maximise(replace(fresh, function=clocked), maximiser, budget, np.random.default_rng(seed), rules)
     own_seconds = max(0.0, time.process_time() - start - inside)
-    if report.best_value > landscape.maximum + 10 * DIGITS * max(1.0, abs(landscape.maximum)):
+    if report.best_value > landscape.maximum + 10 * KNOWN_MAXIMUM_ACCURACY * max(1.0, abs(landscape.maximum)):
         raise InputError(
             f"{landscape.name}: the value {report.best_value:.12g} exceeds its maximum {landscape.maximum:.12g}"
         )

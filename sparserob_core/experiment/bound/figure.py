@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sparserob_core.experiment.bound.record import Bound, WorstCase
 
 MAX_PANELS = 8  # largest number of panels: more of them are too small to be read on a page
-ROOM = 0.12  # empty space above and below the curves, as a share of their height
+EMPTY_HEIGHT_SHARE = 0.12  # empty space above and below the curves, as a share of their height
 
 
 def draw_bound(found: Bound) -> Figure:
@@ -46,7 +46,7 @@ def _draw_panel(ax: Axes, rows: list[WorstCase]) -> None:
     low, high = float(finite.min(initial=0.0)), float(finite.max(initial=0.0))
     near = [wall for wall in walls if low - 2.0 * (high - low) <= wall <= high + 2.0 * (high - low)]
     low, high = min([low, *near]), max([high, *near])
-    room = ROOM * max(high - low, 1e-300)
+    room = EMPTY_HEIGHT_SHARE * max(high - low, 1e-300)
     ax.set_ylim(low - room, high + room)
     for row in rows:
         colour = look.BLUE if row.sense == "sup" else look.ORANGE

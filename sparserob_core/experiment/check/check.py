@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sparserob_core.sip.program import SemiInfiniteProgram
 
 REPEATED = 16  # bytes of arrays for each character of the files: true runs need 7; a larger limit only costs memory
-SPARE = 2**20  # bytes for numbers that stand in neither certificate nor config, which are some kB
+SPARE_BYTES = 2**20  # bytes for numbers that stand in neither certificate nor config, which are some kB
 STATUS = {"holds": 0, "not checked": 1, "fails": 2}
 
 
@@ -219,7 +219,7 @@ def _bound_array_bytes(directory: Path, case: Case) -> int:
     hold the control on its pieces.
     """
     file_bytes = sum((directory / name).stat().st_size for name in ("certificate.json", "config.yaml"))
-    return SPARE + REPEATED * (file_bytes + 8 * case.control.pieces * case.problem.system.controls)
+    return SPARE_BYTES + REPEATED * (file_bytes + 8 * case.control.pieces * case.problem.system.controls)
 
 
 def _check_config(loaded: Loaded, data: Mapping[str, Any], summary: Mapping[str, Any]) -> Finding:

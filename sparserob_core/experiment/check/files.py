@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from sparserob_core.experiment.config.load import Loaded
     from sparserob_core.sip.convex_set import Array
 
-FIGURES = 1e-12  # relative error that is allowed to numbers that are computed anew
-CLOSE = 1e-9  # the same for numbers with rounding errors: the largest cost, points that were moved into their sets
+DERIVED_TOLERANCE = 1e-12  # relative error that is allowed to numbers that are computed anew
+# The same for numbers with rounding errors: the largest cost, points that were moved into their sets
+RECOMPUTED_TOLERANCE = 1e-9
 READ = {"config.yaml", "certificate.json", "result.json", "solution.npz"}
 
 
@@ -288,7 +289,7 @@ def _compare_gap(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     if not (isinstance(cost, float) and isinstance(lower, float) and isinstance(gap, float)):
         return ["cost, lower_bound and gap are no numbers"]
     derived, earlier = relative_gap(case, cost, lower), (cost - lower) / max(1.0, abs(cost))
-    close = any(abs(gap - value) <= FIGURES + 1e-6 * abs(value) for value in (derived, earlier))
+    close = any(abs(gap - value) <= DERIVED_TOLERANCE + 1e-6 * abs(value) for value in (derived, earlier))
     return [] if close else [f"gap is {gap!r}, not {derived!r}"]
 
 
@@ -305,7 +306,11 @@ def _compare_cost_scale(case: Case, summary: Mapping[str, Any]) -> list[str] | N
     derived = added_up(case) if has_decision else 0.0
     rounded = AGREED * CANCELLED * compared(case) if has_decision else 0.0
     is_near = isinstance(cost_scale, float) and abs(cost_scale - derived) <= rounded
-    agrees = is_near or _is_close(cost_scale, derived, CLOSE) or _is_close(cost_scale, largest_cost(case), CLOSE)
+    agrees = (
+        is_near
+        or _is_close(cost_scale, derived, RECOMPUTED_TOLERANCE)
+        or _is_close(cost_scale, largest_cost(case), RECOMPUTED_TOLERANCE)
+    )
     return [] if agrees else [f"cost_scale is {cost_scale!r}, not {derived!r}"]
 
 
@@ -349,7 +354,7 @@ def _compare_value(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     from sparserob_core.checker.claims.claims import compared
 
     value, cost = summary.get("value"), summary.get("cost")
-    slack = FIGURES * CANCELLED * compared(case)
+    slack = DERIVED_TOLERANCE * CANCELLED * compared(case)
     near = isinstance(value, float) and isinstance(cost, float) and abs(value - cost) <= slack
     return [] if near or _is_close(value, cost) else [f"value is {value!r} without a regulariser, the cost {cost!r}"]
 
@@ -414,7 +419,7 @@ def _compare_worst_violation(case: Case, said: Mapping[str, Any]) -> list[str]:
         centre = np.asarray(case.problem.initial_state)
         if (
             initial_state.shape != centre.shape
-            or _measure_excess(case.problem.initial_set, initial_state, centre) > CLOSE
+            or _measure_excess(case.problem.initial_set, initial_state, centre) > RECOMPUTED_TOLERANCE
         ):
             return [f"worst: {initial_state.tolist()} is no initial state"]
         violations.append((f" from {initial_state.tolist()}", *exceeded(case, said, initial_state)))
@@ -455,7 +460,7 @@ def _is_close_point(said: object, point: object) -> bool:
     """Return whether two points agree, where one of them was moved into its set against rounding errors."""
     if not (isinstance(said, list) and isinstance(point, list) and len(said) == len(point)):
         return False
-    return all(_is_close(a, b, CLOSE) for a, b in zip(said, point, strict=True))
+    return all(_is_close(a, b, RECOMPUTED_TOLERANCE) for a, b in zip(said, point, strict=True))
 
 
 WORST = {"violation", "constraint", "time", "parameter", "initial_state"}
@@ -515,7 +520,7 @@ def _is_equal(said: object, value: object) -> bool:
     return said == value and isinstance(said, bool) is isinstance(value, bool)
 
 
-def _is_close(said: object, value: object, figures: float = FIGURES) -> bool:
+def _is_close(said: object, value: object, figures: float = DERIVED_TOLERANCE) -> bool:
     """Return whether two entries of JSON agree, numbers up to rounding errors."""
     numbers = [entry for entry in (said, value) if isinstance(entry, int | float) and not isinstance(entry, bool)]
     if len(numbers) == 2:
@@ -560,7 +565,7 @@ def _compare_solution(stored: StoredRun, case: Case) -> Verdicts:
             and all(np.array_equal(arrays[k], np.array(case.certificate.get(k, []), dtype=float)) for k in answered)
             and np.array_equal(breakpoints, case.control.breakpoints)
             and control.shape == size.shape
-            and bool((np.abs(control - expected) <= FIGURES * size).all())
+            and bool((np.abs(control - expected) <= DERIVED_TOLERANCE * size).all())
         )
     except InputError as error:
         return [f"it cannot be read: {error}"], "", []
@@ -588,7 +593,9 @@ def _compare_worst_disturbance(case: Case, arrays: Mapping[str, Any]) -> dict[st
     try:
         signal = numbers(witness["disturbance"], "disturbance")
         size = np.abs(disturbance).max(initial=0.0)
-        close = signal.shape == disturbance.shape and bool((np.abs(signal - disturbance) <= CLOSE * size).all())
+        close = signal.shape == disturbance.shape and bool(
+            (np.abs(signal - disturbance) <= RECOMPUTED_TOLERANCE * size).all()
+        )
     except (Broken, TypeError):  # rows of different lengths, or text
         close = False
     return {"worst_disturbance": "" if close else "its worst disturbance is not that of the witness"}

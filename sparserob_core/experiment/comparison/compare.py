@@ -17,7 +17,7 @@ from sparserob_core.experiment.comparison.figure import draw_comparison
 from sparserob_core.experiment.comparison.labels import labels
 from sparserob_core.experiment.comparison.profiles import Measure, Profiles
 from sparserob_core.experiment.comparison.profiles_figure import draw_profiles
-from sparserob_core.experiment.comparison.studies import ACCURACY, SLACK, is_study, read_profiles
+from sparserob_core.experiment.comparison.studies import BOUND_CONTRADICTION, PROFILE_ACCURACY, is_study, read_profiles
 from sparserob_core.experiment.config.plain import difference, value_text
 from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable, save_figure
 from sparserob_core.experiment.run.events import Broadcast, Event, Observer, SweepFinished, SweepStarted
@@ -30,7 +30,7 @@ def compare(
     runs: Sequence[GivenRun],
     out: str | Path | None = None,
     *,
-    accuracy: float = ACCURACY,
+    accuracy: float = PROFILE_ACCURACY,
     measure: Measure | None = None,
     observers: Iterable[Observer] = (),
 ) -> Comparison | Profiles:
@@ -175,7 +175,7 @@ def comparison_remarks(comparison: Comparison) -> Iterator[str]:
             f"exact optimum {comparison.exact:.9g}{unit}: certified by {comparison.labels[comparison.certified]} "
             f"to a relative gap of {best.gap:.1e}"
         )
-        above = best.upper_bound + SLACK * max(1.0, abs(best.upper_bound))
+        above = best.upper_bound + BOUND_CONTRADICTION * max(1.0, abs(best.upper_bound))
     for curve, label in zip(comparison.curves, comparison.labels, strict=True):
         if not curve.bound.size:
             yield f"no curve of {label}: {_explain_missing_curve(curve)}"

@@ -24,8 +24,6 @@ DASHES: tuple[Any, ...] = ("solid", (0, (1, 1)), (0, (4, 1, 1, 1)))
 MARKERS = "osD^vP"
 LINE = 84
 """Letters of a label in one line of the legend; half of them when two labels share the line."""
-VIEW = 1.5
-"""The view reaches down by this many times the size of the optimum; first bounds of a search may be far below."""
 
 
 def draw_comparison(comparison: Comparison) -> Figure:
@@ -38,7 +36,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
     curves, texts = [curve for curve, _ in drawn], [fill(plain(label), LINE) for _, label in drawn]
     columns = 2 if max(map(len, texts)) <= LINE // 2 else 1
     lines = ceil((sum(text.count("\n") + 1 for text in texts) + 1) / columns)
-    figure = Figure(figsize=(look.WIDTH, 3.2 + 0.165 * lines), layout="constrained")
+    figure = Figure(figsize=(look.FIGURE_WIDTH, 3.2 + 0.165 * lines), layout="constrained")
     left_ax, right_ax = figure.subplots(1, 2, sharey=True)
     for number, (curve, text) in enumerate(zip(curves, texts, strict=True)):
         pen = _choose_pen(number, len(curves), curve.searched)
@@ -124,6 +122,6 @@ def _scale_axis(ax: Axes) -> None:
 def _compute_limits(exact: float, curves: list[Curve]) -> tuple[float, float]:
     bounds = np.concatenate([curve.bound for curve in curves])
     top = float(np.nanmax([exact, bounds.max()]))
-    low = max(float(bounds.min()), top - VIEW * abs(top)) if top else float(bounds.min())
+    low = max(float(bounds.min()), top - look.VIEW_BELOW_OPTIMUM * abs(top)) if top else float(bounds.min())
     margin = 0.06 * max(top - low, 1e-9 * max(1.0, abs(top)))
     return low - margin, top + margin

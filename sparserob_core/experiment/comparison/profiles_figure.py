@@ -28,7 +28,7 @@ def draw_profiles(profiles: Profiles) -> Figure:
     texts = [fill(name, LINE) for name in profiles.contenders]
     columns = 2 if max(map(len, texts)) <= LINE // 2 else 1
     lines = ceil(sum(text.count("\n") + 1 for text in texts) / columns)
-    figure = Figure(figsize=(look.WIDTH, 3.2 + 0.165 * lines), layout="constrained")
+    figure = Figure(figsize=(look.FIGURE_WIDTH, 3.2 + 0.165 * lines), layout="constrained")
     left_ax, right_ax = figure.subplots(1, 2, sharey=True)
     has_band = max(len(seeds) for seeds in profiles.seeds) > 1
     for s, text in enumerate(texts):

@@ -18,8 +18,8 @@ from sparserob_core.experiment.config.plain import IRRELEVANT, value_text
 from sparserob_core.experiment.sweep.plan import FILE
 from sparserob_core.experiment.sweep.study import RUNS, read_study
 
-ACCURACY = 0.01
-SLACK = 1e-7
+PROFILE_ACCURACY = 0.01  # of the best value: a run is counted as solved from there on, unless stated otherwise
+BOUND_CONTRADICTION = 1e-7
 """By how much a proven bound may exceed another run's before one of them is called wrong, relative to the larger of 1
 and its size."""
 PROBLEM = ("problem", "dictionaries", "policy")
@@ -136,7 +136,11 @@ def _find_exact_value(curves: Sequence[Curve]) -> tuple[float, bool] | None:
 
 def _list_contradictions(label: str, curves: Sequence[Curve]) -> Iterator[str]:
     above = min((curve.upper_bound for curve in curves if curve.status == "certified"), default=np.inf)
-    wrong = [curve for curve in curves if curve.bound.size and curve.bound[-1] > above + SLACK * max(1.0, abs(above))]
+    wrong = [
+        curve
+        for curve in curves
+        if curve.bound.size and curve.bound[-1] > above + BOUND_CONTRADICTION * max(1.0, abs(above))
+    ]
     for curve in wrong:
         yield (
             f"{label}: the lower bound of {curve.directory} exceeds the certified upper bound {above:.9g}: one is wrong"

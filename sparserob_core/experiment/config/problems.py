@@ -73,7 +73,7 @@ def _check_interval(value: object) -> object:
 Interval: TypeAlias = Annotated[tuple[float, float], BeforeValidator(_check_interval)]
 Rows: TypeAlias = Annotated[list[Annotated[list[Entry], Field(min_length=1)]], Field(min_length=1), OrPacked()]
 Column: TypeAlias = Annotated[list[Entry], Field(min_length=1), OrPacked(column=True)]
-MAX_PIECES = 1_000_000  # the same limit as that of a dictionary of equal pieces
+MAX_CONFIG_PIECES = 1_000_000  # the same limit as that of a dictionary of equal pieces
 Matrix: TypeAlias = Annotated[list[Annotated[list[float], Field(min_length=1)]], Field(min_length=1), OrPacked()]
 
 
@@ -396,7 +396,7 @@ class DisturbanceOptions(Sparse):
     stop: float | None = Field(default=None, alias="to", ge=0.0)
     """Time at which it ceases to act; the horizon unless given."""
 
-    pieces: int | None = Field(default=None, ge=1, le=MAX_PIECES)
+    pieces: int | None = Field(default=None, ge=1, le=MAX_CONFIG_PIECES)
     """Number of equal pieces on which it is constant; those of ``dictionaries.disturbance`` unless ``pieces`` or
     ``breakpoints`` is given."""
 

@@ -25,9 +25,9 @@ from sparserob_core.sip.working.unbounded import complete_multipliers
 if TYPE_CHECKING:
     from sparserob_core.control.studies.causal import CausalBound
 
-FORMAT = 1
+FORMAT = 1  # the version of `certificate.json`, by which older ones are read
 MANY_CELLS = 1000  # number of cells from which neighbours that are whole pieces are written as one
-INWARDS = 1.0 - 1e-13  # factor by which points of a curved set are moved inwards, against rounding errors
+INWARD_FACTOR = 1.0 - 1e-13  # factor by which points of a curved set are moved inwards, against rounding errors
 WELL = 1e-14  # distance from the boundary at which a point need not be moved, relative to that from the middle
 
 
@@ -386,7 +386,7 @@ def _move_inside(bound: ConvexSet, point: Array, middle: Array) -> Array:
         return np.asarray(np.clip(point, box.lower, box.upper))
     if float(bound.violation(point)) < -WELL * float(np.abs(point - middle).max()):
         return point
-    answer: Array = middle + INWARDS * (point - middle)
+    answer: Array = middle + INWARD_FACTOR * (point - middle)
     return answer
 
 

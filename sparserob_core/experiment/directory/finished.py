@@ -34,8 +34,9 @@ UNFINISHED = "the run has not finished"
 NUMBERS = ("cost", "value", "epsilon", "lower_bound", "upper_bound", "gap", "seconds")
 # arrays of a feedback decision: gains, the observer where outputs are measured, and the gains of an inner loop
 ANSWERS = ("gains", "observer", "prestabilise")
-SAME = 1e-9  # difference that is allowed between dependent arrays, as a share of the largest number of the array
-MAX_TEXT = 2**27
+# Difference that is allowed between dependent arrays, as a share of the largest number of the array
+ARRAY_TOLERANCE = 1e-9
+MAX_JSON_BYTES = 2**27
 """Largest number of bytes of a JSON file. The largest that runs write have some 10 million; with ten times the limit a
 file could take all memory of a machine."""
 MAX_ENTRIES, MAX_LISTS = 2**23, 2**21
@@ -56,7 +57,7 @@ class StoredRun:
     """The files of a run directory, each read when it is first needed.
 
     Every property raises `InputError` that names its file, where this is missing, cannot be read or does not fit. It
-    does so too where its arrays take more than ``largest`` bytes (`LARGEST` unless given).
+    does so too where its arrays take more than ``largest`` bytes (`MAX_ARRAY_BYTES` unless given).
     """
 
     directory: Path
@@ -239,7 +240,7 @@ class FinishedRun:
                 stored is None
                 or stored.size != value.size
                 or stored.dtype.kind != "f"
-                or not (np.abs(stored.ravel() - value.ravel()) <= SAME * size).all()
+                or not (np.abs(stored.ravel() - value.ravel()) <= ARRAY_TOLERANCE * size).all()
             ):
                 raise InputError(
                     f"{self.directory / 'solution.npz'}: {name}: expected what follows from the decision beside it, got"
@@ -373,8 +374,8 @@ def read_json(file: Path) -> dict[str, Any]:
 def _read_json(file: Path) -> tuple[object, bool]:
     """Return the data of a JSON file, and whether any of its numbers may be infinite or NaN."""
     size, suspects = file.stat().st_size, list[str]()
-    if size > MAX_TEXT:
-        raise InputError(f"{file}: cannot be read: expected at most {MAX_TEXT} bytes, got {size}")
+    if size > MAX_JSON_BYTES:
+        raise InputError(f"{file}: cannot be read: expected at most {MAX_JSON_BYTES} bytes, got {size}")
     text = file.read_text(encoding="utf-8")
     for kind, count, limit in (
         ("entries", text.count(","), MAX_ENTRIES),

@@ -13,7 +13,7 @@ from sparserob_core.errors import InputError
 
 NAME = ".lock"
 GUARD = ".lock.takeover"
-TRIES = 3  # attempts to take a lock that others take and release at the same moment
+LOCK_ATTEMPTS = 3  # attempts to take a lock that others take and release at the same moment
 
 
 @final
@@ -30,7 +30,7 @@ class Lock:
     def acquire(self) -> None:
         """Take the lock; raises `InputError` where somebody else holds it, and `OSError` where nothing can be
         written."""
-        for _ in range(TRIES):
+        for _ in range(LOCK_ATTEMPTS):
             try:
                 self.file.touch(exist_ok=False)
             except FileExistsError:

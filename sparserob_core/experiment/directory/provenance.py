@@ -14,7 +14,7 @@ from typing import Any
 from sparserob_core.encodings import path_of
 from sparserob_core.experiment.config.plain import identity
 
-PATIENCE = 5.0  # seconds for git
+GIT_SECONDS = 5.0  # seconds for git
 
 
 def provenance(plain: Mapping[str, Any], git: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -60,7 +60,13 @@ def git_revision(folder: Path) -> dict[str, Any] | None:
     command = ["git", "-c", "core.fsmonitor=false", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
         process = subprocess.run(
-            command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE, check=False, stdin=subprocess.DEVNULL
+            command,
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=GIT_SECONDS,
+            check=False,
+            stdin=subprocess.DEVNULL,
         )
     except (OSError, subprocess.SubprocessError):
         return None

@@ -16,7 +16,7 @@ from sparserob_core.sip.program import Formulation
 CUTS = ("families", "indices", "rows", "multipliers")
 FORMULATIONS = "formulations"
 BOUND = "bound_"  # prefix of the arrays in solution.npz for the constraints that prove the bound
-NUMBERS = 500_000  # largest total size of the decisions that a run keeps
+MAX_DECISION_NUMBERS = 500_000  # largest total size of the decisions that a run keeps
 
 
 def round_arrays(history: Sequence[RoundFinished]) -> dict[str, Array]:
@@ -25,10 +25,14 @@ def round_arrays(history: Sequence[RoundFinished]) -> dict[str, Array]:
     They are the ``decisions (r, n)`` of all rounds and their ``costs (r,)``. For every imposed constraint ``rounds
     (c,)`` has its round, counted from 0; ``families``, ``formulations``, ``indices`` (padded with NaN), ``rows`` and
     ``multipliers`` describe it. The mapping is empty where a decision is unknown, or the total size of all exceeds
-    `NUMBERS`.
+    `MAX_DECISION_NUMBERS`.
     """
     decisions = [entry.decision for entry in history if entry.decision is not None]
-    if not decisions or len(decisions) < len(history) or sum(decision.size for decision in decisions) > NUMBERS:
+    if (
+        not decisions
+        or len(decisions) < len(history)
+        or sum(decision.size for decision in decisions) > MAX_DECISION_NUMBERS
+    ):
         return {}
     cuts = [(number, cut) for number, entry in enumerate(history) for cut in entry.imposed]
     width = max((cut.index.size for _, cut in cuts), default=0)

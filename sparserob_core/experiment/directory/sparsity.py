@@ -9,7 +9,7 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.result import Result
 
-ZERO = 1e-6
+NEGLIGIBLE_CONTROL_SHARE = 1e-6  # of the largest control, or of 1: a smaller control counts as off
 PROVEN, SAME = "L1 is sparsest here: proven", 1e-6
 
 
@@ -35,7 +35,7 @@ class Sparsity:
 
 def sparsity(control: Array, breakpoints: Array) -> Sparsity:
     """Return the `Sparsity` of a control ``(m, K)`` on the pieces between ``breakpoints (K + 1,)``."""
-    threshold = ZERO * max(1.0, float(np.abs(control).max(initial=0.0)))
+    threshold = NEGLIGIBLE_CONTROL_SHARE * max(1.0, float(np.abs(control).max(initial=0.0)))
     active = (np.abs(control) > threshold).any(axis=0)
     lengths = np.diff(breakpoints)
     return Sparsity(

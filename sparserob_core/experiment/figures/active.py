@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sparserob_core.control.transcription.record import Transcription
     from sparserob_core.sip.evidence import Cut
 
-NOTHING = 1e-9  # of the largest multiplier: the rounding of a solver
+NEGLIGIBLE_MULTIPLIER = 1e-9  # of the largest multiplier: the rounding of a solver
 
 
 @final
@@ -46,7 +46,7 @@ def stored_active(model: Transcription, solution: Mapping[str, Array]) -> Active
     if not {"times", "multipliers", "families", "rows"} <= set(solution):
         return marks_of(model, ())
     multipliers = solution["multipliers"]
-    kept = multipliers > NOTHING * multipliers.max(initial=0.0)
+    kept = multipliers > NEGLIGIBLE_MULTIPLIER * multipliers.max(initial=0.0)
     entries = zip(*(solution[name][kept].tolist() for name in ("families", "times", "rows")), strict=True)
     return _collect_active(model, [entry for entry in entries if _has_time(model, entry[0])])
 

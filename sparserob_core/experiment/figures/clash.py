@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
     from sparserob_core.experiment.assemble import Experiment
 
-SHOWN = 8  # quantities at most
+MAX_QUANTITIES = 8  # quantities at most
 BAR = 0.16  # half the height of a bar
-ROOM = (
+SIDE_SHARE = (
     0.3  # of what a picture shows, on either side: of a tenth a wall stands at its edge, of ten times is a line again
 )
 
@@ -60,7 +60,7 @@ class Strip:
         """
         ends = [self.low, self.high, self.best - self.sigma_low, self.best + self.sigma_high]
         shown = [value for value in ends if np.isfinite(value)]
-        room = ROOM * max(max(shown) - min(shown), 1e-9)
+        room = SIDE_SHARE * max(max(shown) - min(shown), 1e-9)
         return min(shown) - room, max(shown) + room
 
     @property
@@ -96,7 +96,7 @@ def clash_figure(experiment: Experiment, result: Result) -> Figure:
     from matplotlib.figure import Figure
 
     with look.style():
-        figure = Figure(figsize=(look.WIDTH, 0.95 * len(strips) + 1.15), layout="constrained")
+        figure = Figure(figsize=(look.FIGURE_WIDTH, 0.95 * len(strips) + 1.15), layout="constrained")
         axes = list(figure.subplots(len(strips), 1, squeeze=False)[:, 0])
         for ax, strip in zip(axes, strips, strict=True):
             _draw_strip(ax, strip)
@@ -125,7 +125,7 @@ def clash_strips(program: SemiInfiniteProgram, result: Result) -> list[Strip]:
         strip = None if family is None else _make_strip(program, family, cut)
         if strip is not None:
             strips.setdefault(strip.label, strip)
-    return list(strips.values())[:SHOWN]
+    return list(strips.values())[:MAX_QUANTITIES]
 
 
 def _make_strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> Strip | None:

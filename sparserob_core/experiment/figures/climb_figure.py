@@ -20,10 +20,9 @@ if TYPE_CHECKING:
 
 NOTES = 3  # of the maximiser, at most, each in a panel of its own
 MEAN = 50  # evaluations over which the share of accepted ones is taken
-ROOM = 0.11  # share of the evaluations from which on a stage has room for words
-FINEST = 1e-10  # of the highest value: what is nearer to it is drawn there
-VIEW = 1.5  # the view of the bound reaches down by this many times the size of the optimum
-MANY = 3000  # dots beyond which a figure for print holds them as a picture
+MIN_LABELLED_SHARE = 0.11  # share of the evaluations from which on a stage has room for words
+NEAREST_TO_HIGHEST = 1e-10  # of the highest value: what is nearer to it is drawn there
+MAX_VECTOR_DOTS = 3000  # dots beyond which a figure for print holds them as a picture
 FIRST = ("temperature", "accepted", "scale", "depth", "constant")
 
 
@@ -36,7 +35,7 @@ def draw_climb(trace: SearchTrace, title: str, upper: float = np.inf, *, exact: 
 
     note_names = _choose_notes(trace)
     heights = [2.6, 1.35, *[0.95] * len(note_names)]
-    figure = Figure(figsize=(look.WIDTH, sum(heights) + 1.25), layout="constrained")
+    figure = Figure(figsize=(look.FIGURE_WIDTH, sum(heights) + 1.25), layout="constrained")
     axes: list[Axes] = list(
         figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0],
     )
@@ -120,7 +119,7 @@ def _compute_distances(trace: SearchTrace, stages: list[tuple[float, int, int]])
 
 def _compute_floor(below: Array, tops: list[float]) -> float:
     """The place of the highest values themselves, which a logarithmic axis does not have: under everything else."""
-    finest = FINEST * max([abs(top) for top in tops if np.isfinite(top)], default=1.0)
+    finest = NEAREST_TO_HIGHEST * max([abs(top) for top in tops if np.isfinite(top)], default=1.0)
     positive = below[below > finest]
     return float(positive.min()) / 4.0 if positive.size else max(finest, 1e-12)
 
@@ -133,11 +132,13 @@ def _label_stage(ax: Axes, k: int, stages: list[tuple[float, int, int]], top: fl
     """The weight and the highest value above a stage, where there is room for them."""
     epsilon, first, last = stages[k]
     share = (last - first) / stages[-1][2]
-    if share >= ROOM:
+    if share >= MIN_LABELLED_SHARE:
         ax.text(
             (first + last + 1) / 2,
             1.02,
-            rf"$\varepsilon$ = {epsilon:.3g}" + "\n" + rf"$g$ = {top:.{6 if share >= 1.4 * ROOM else 4}g}",
+            rf"$\varepsilon$ = {epsilon:.3g}"
+            "\n"
+            rf"$g$ = {top:.{6 if share >= 1.4 * MIN_LABELLED_SHARE else 4}g}",
             transform=ax.get_xaxis_transform(),
             fontsize=8.5,
             color=look.GREY,
@@ -164,7 +165,7 @@ def _draw_dots(ax: Axes, trace: SearchTrace, short: Array) -> None:
                 color=colour if colour != look.MIST else "#BDBDBD",
                 zorder=1,
                 label=label,
-                rasterized=short.size > MANY,
+                rasterized=short.size > MAX_VECTOR_DOTS,
             )
 
 
@@ -199,7 +200,11 @@ def _draw_bound(ax: Axes, trace: SearchTrace, upper: float, exact: bool, unit: s
         ax.text(0.5, 0.5, "no bound was proven", transform=ax.transAxes, ha="center", color=look.GREY)
         return
     top = float(max(upper if np.isfinite(upper) else -np.inf, trace.bound[is_known].max()))
-    low = max(float(trace.bound[is_known].min()), top - VIEW * abs(top)) if top else float(trace.bound[is_known].min())
+    low = (
+        max(float(trace.bound[is_known].min()), top - look.VIEW_BELOW_OPTIMUM * abs(top))
+        if top
+        else float(trace.bound[is_known].min())
+    )
     margin = 0.08 * max(top - low, 1e-9 * max(1.0, abs(top)))
     ax.set_ylim(low - margin, top + margin)
     if np.isfinite(upper):

@@ -36,14 +36,16 @@ from sparserob_core.sip.events import RoundFinished
 if TYPE_CHECKING:
     from sparserob_core.experiment.directory.finished import FinishedRun
 
-TIMES = 400  # drawn at most
-SMOOTH = 200  # drawn at least, about
-ROUGH = 6  # times at which it is told which states move far: with 2 a state that comes back seems to rest; with 60 the
+MAX_DRAWN_TIMES = 400  # drawn at most
+MIN_DRAWN_TIMES = 200  # drawn at least, about
+# Times at which it is told which states move far: with 2 a state that comes back seems to rest; with 60 the
+SAMPLED_TIMES = 6
 # figures of 270 states take longer than their control
-DRAWS = 2000  # of which the quantiles of the control are drawn
-CORNERS = 48  # of the polygon around every place, which reaches 0.2 % beyond a disc, and 3 % of its length beside a
+QUANTILE_DRAWS = 2000  # of which the quantiles of the control are drawn
+# Of the polygon around every place, which reaches 0.2 % beyond a disc, and 3 % of its length beside a
+POLYGON_CORNERS = 48
 # segment: with a tenth a path is twice as wide as it is; ten times takes seconds and looks the same
-STEPS = 33  # times of a window at which a side that moves is drawn
+TIMES_OF_MOVING_SIDE = 33  # times of a window at which a side that moves is drawn
 QUANTILES = (0.05, 0.5, 0.95)
 
 
@@ -156,7 +158,7 @@ def choose_states(experiment: Experiment, theta: Array) -> Sequence[int] | None:
     problem, own_states = model.problem, model.problem.names.corners.own(model.problem.system.states)
     if len(own_states) <= MAX_STATES:
         return own_states
-    rough_tube = _compute_tube(model, np.ravel(theta), np.linspace(0.0, problem.horizon, ROUGH), own_states)
+    rough_tube = _compute_tube(model, np.ravel(theta), np.linspace(0.0, problem.horizon, SAMPLED_TIMES), own_states)
     reach = rough_tube.upper.max(axis=1) - rough_tube.lower.min(axis=1)
     return sorted({*telling(reach, [*_list_walls(model)])[:MAX_STATES], *(problem.names.in_plane or ())})
 
@@ -221,9 +223,9 @@ def _compute_outputs(model: Transcription, decision: Array, times: Array) -> Mea
 
 def _choose_times(points: Array) -> Array:
     """Breakpoints and times between them that show how a state moves; of very many breakpoints some."""
-    if points.size > TIMES + 1:
-        return np.asarray(points[np.unique(np.linspace(0, points.size - 1, TIMES + 1).round().astype(int))])
-    per_piece = max(1, SMOOTH // (points.size - 1))
+    if points.size > MAX_DRAWN_TIMES + 1:
+        return np.asarray(points[np.unique(np.linspace(0, points.size - 1, MAX_DRAWN_TIMES + 1).round().astype(int))])
+    per_piece = max(1, MIN_DRAWN_TIMES // (points.size - 1))
     times = points[:-1, None] + np.diff(points)[:, None] * (np.arange(per_piece) / per_piece)
     return np.append(times.ravel(), points[-1])
 
@@ -259,9 +261,9 @@ def _project_onto_plane(model: Transcription, decision: Array, times: Array) -> 
     pair, problem = model.problem.names.in_plane, model.problem
     if pair is None:
         return None
-    angles = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
+    angles = 2.0 * np.pi * np.arange(POLYGON_CORNERS) / POLYGON_CORNERS
     normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    directions = np.zeros((CORNERS, problem.system.states))
+    directions = np.zeros((POLYGON_CORNERS, problem.system.states))
     directions[:, pair] = normals
     heights = supports(model, decision, times, directions)
     next_normals, next_heights = np.roll(normals, -1, axis=0), np.roll(heights, -1, axis=0)
@@ -269,7 +271,9 @@ def _project_onto_plane(model: Transcription, decision: Array, times: Array) -> 
         np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)[:, None] for vectors in (normals, next_normals)
     )
     # where the lines c'y = h of two neighbouring directions meet
-    places = (next_heights[..., None] * tangents - heights[..., None] * next_tangents) / np.sin(2.0 * np.pi / CORNERS)
+    places = (next_heights[..., None] * tangents - heights[..., None] * next_tangents) / np.sin(
+        2.0 * np.pi / POLYGON_CORNERS
+    )
     return Plane(states=pair, places=places.transpose(1, 0, 2), limits=tuple(_list_limits(model.stated, pair, normals)))
 
 
@@ -282,7 +286,9 @@ def _list_limits(problem: OptimalControlProblem, pair: tuple[int, int], around: 
             continue
         normals, bounds = _select_sides(entry.set, pair, around)
         stop, reference = end if entry.stop is None else float(entry.stop), Reference.of(entry.relative_to)
-        times = np.unique(np.concatenate([np.linspace(entry.start, stop, STEPS), reference.kinks(entry.start, stop)]))
+        times = np.unique(
+            np.concatenate([np.linspace(entry.start, stop, TIMES_OF_MOVING_SIDE), reference.kinks(entry.start, stop)])
+        )
         offsets = reference.along(times, np.eye(entry.set.dimension)[list(pair)])
         limit = Limit(name=printable(name), normals=normals, times=times, bounds=bounds + offsets @ normals.T)
         if len(normals):

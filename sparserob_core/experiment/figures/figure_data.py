@@ -17,7 +17,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
 
 MAX_STATES = 12  # drawn in one figure
-IDLE = 1e-7  # of the largest control: less than that is no action but rounding
+NEGLIGIBLE_CONTROL = 1e-7  # of the largest control: less than that is no action but rounding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +158,9 @@ class FigureData:
     def arcs(self) -> list[Array]:
         """The parts of the path on which the control acts, ``(k, 2)`` each, where there are others."""
         size, path = np.abs(self.control), self.path
-        acts = (size > IDLE * np.maximum(size.max(axis=1, initial=0.0), np.finfo(float).tiny)[:, None]).any(axis=0)
+        acts = (
+            size > NEGLIGIBLE_CONTROL * np.maximum(size.max(axis=1, initial=0.0), np.finfo(float).tiny)[:, None]
+        ).any(axis=0)
         if acts.all():
             return []
         changes, arcs = np.diff(np.concatenate([[False], acts, [False]]).astype(int)), []

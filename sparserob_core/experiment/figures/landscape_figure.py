@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
-FLAT = 1e-9  # of the value: what varies by less does not vary
-MAX_POINTS = 2000  # visited points that are drawn
+FLAT_VALUE_SHARE = 1e-9  # of the value: what varies by less does not vary
+MAX_DRAWN_POINTS = 2000  # visited points that are drawn
 
 
 @final
@@ -57,7 +57,8 @@ class LandscapeData:
         finite_values = self.values[np.isfinite(self.values)]
         spread = float(finite_values.max() - finite_values.min()) if finite_values.size else 0.0
         return bool(
-            finite_values.size == self.values.size and spread <= FLAT * max(1.0, float(np.abs(finite_values).max()))
+            finite_values.size == self.values.size
+            and spread <= FLAT_VALUE_SHARE * max(1.0, float(np.abs(finite_values).max()))
         )
 
 
@@ -65,7 +66,7 @@ def draw_landscape(data: LandscapeData) -> Figure:
     """A map of two coordinates, or a curve over one, with the visited points, the accepted walk and the best tuple."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(look.WIDTH, 5.2 if len(data.axes) == 2 else 3.6), layout="constrained")
+    figure = Figure(figsize=(look.FIGURE_WIDTH, 5.2 if len(data.axes) == 2 else 3.6), layout="constrained")
     ax = figure.subplots()
     if len(data.axes) == 2:
         _draw_map(figure, ax, data)
@@ -125,7 +126,7 @@ def _draw_map(figure: Figure, ax: Axes, data: LandscapeData) -> None:
                 markeredgewidth=0.3,
                 zorder=3,
                 label=label,
-                rasterized=few.size > MAX_POINTS // 4,
+                rasterized=few.size > MAX_DRAWN_POINTS // 4,
             )
     if accepted_places.size:
         path = data.visited[accepted_places]
@@ -172,9 +173,9 @@ def _draw_curve(ax: Axes, data: LandscapeData) -> None:
 
 
 def _thin_out(places: np.ndarray) -> np.ndarray:
-    """Return at most `MAX_POINTS` of the places, evenly chosen, with the first and the last among them."""
+    """Return at most `MAX_DRAWN_POINTS` of the places, evenly chosen, with the first and the last among them."""
     return (
-        places[np.unique(np.linspace(0, places.size - 1, MAX_POINTS).astype(int))]
-        if places.size > MAX_POINTS
+        places[np.unique(np.linspace(0, places.size - 1, MAX_DRAWN_POINTS).astype(int))]
+        if places.size > MAX_DRAWN_POINTS
         else places
     )

@@ -9,13 +9,16 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 
-MARGIN = 0.08  # of the larger side of what is drawn, around it; ten times as much leaves no picture
+PLANE_MARGIN = 0.08  # of the larger side of what is drawn, around it; ten times as much leaves no picture
 SLIM = 0.25  # of the larger side, the smaller one at least: of a tenth nothing is seen, at 1 all is a square
-SAME = 1e-12  # of coordinates, what is rounding: with 0 a goal that is a point is empty, 1e9 times as much is seen
+# Of coordinates, what is rounding: with 0 a goal that is a point is empty, 1e9 times as much is seen
+COORDINATE_ROUNDING = 1e-12
 # of the larger side: a goal that is smaller is shown larger, too; at 0.5 all are, at 0.005 a dot stays one
 MAX_ENLARGED = 0.05
-CLOSE = 3.0  # sides of the goal that are shown of what is around it; of one no path is seen, of thirty no goal
-NEAR = 0.3  # of the larger side: a wall that is nearer to the path is within the view; of all walls one sees no path
+# Sides of the goal that are shown of what is around it; of one no path is seen, of thirty no goal
+GOAL_SURROUNDINGS = 3.0
+# Of the larger side: a wall that is nearer to the path is within the view; of all walls one sees no path
+VIEW_DISTANCE = 0.3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -91,12 +94,12 @@ class Plane:
             for normal, bounds in zip(limit.normals, limit.bounds.T, strict=True):
                 gaps = (bounds.min() - path @ normal) / (normal @ normal)
                 nearest = int(np.abs(gaps).argmin())
-                if abs(gaps[nearest]) * np.linalg.norm(normal) <= NEAR * size:
+                if abs(gaps[nearest]) * np.linalg.norm(normal) <= VIEW_DISTANCE * size:
                     shown.append((path[nearest] + gaps[nearest] * normal)[None])
         points = np.vstack(shown)
         low, high = points.min(axis=0), points.max(axis=0)
         size = float((high - low).max()) or 1.0
-        missing = np.maximum(SLIM * size - (high - low), 0.0) / 2 + MARGIN * size
+        missing = np.maximum(SLIM * size - (high - low), 0.0) / 2 + PLANE_MARGIN * size
         return low - missing, high + missing
 
     def goal(self, path: Array) -> tuple[Array, Array] | None:
@@ -110,9 +113,12 @@ class Plane:
         if not goals or not len(allowed):
             return None
         side = float(np.ptp(allowed, axis=0).max())
-        if not SAME * float(np.abs(allowed).max()) < side <= MAX_ENLARGED * float((high - low).max()):
+        if not COORDINATE_ROUNDING * float(np.abs(allowed).max()) < side <= MAX_ENLARGED * float((high - low).max()):
             return None
-        middle, half = (allowed.min(axis=0) + allowed.max(axis=0)) / 2, CLOSE * side / 2 * np.array([1.0, 0.5])
+        middle, half = (
+            (allowed.min(axis=0) + allowed.max(axis=0)) / 2,
+            GOAL_SURROUNDINGS * side / 2 * np.array([1.0, 0.5]),
+        )
         return middle - half, middle + half
 
 
@@ -127,7 +133,9 @@ def clipped(polygon: Array, normals: Array, bounds: Array) -> Array:
     kept = np.asarray(polygon, dtype=float)
     for normal, bound in zip(normals, bounds, strict=True):
         heights, corners = kept @ normal - bound, []
-        heights[np.abs(heights) <= SAME * (np.abs(kept) @ np.abs(normal))] = 0.0  # of a side that was cut before
+        heights[np.abs(heights) <= COORDINATE_ROUNDING * (np.abs(kept) @ np.abs(normal))] = (
+            0.0  # of a side that was cut before
+        )
         for k in range(len(kept)):
             a, b = heights[k - 1], heights[k]
             if (a > 0.0) != (b > 0.0):

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from sparserob_core.sip.convex_set import Array
 
 PALE = "#BEE1F6"  # SKY at 45 % on white
-POINT = 0.01  # of the larger side: a smaller goal is drawn as a mark; at a tenth boxes that one sees become marks
+# Of the larger side: a smaller goal is drawn as a mark; at a tenth boxes that one sees become marks
+MARKED_GOAL_SHARE = 0.01
 # of the width: of nearer marks one has its time above, the lower one below; of a tenth all are one blot
 MIN_SPACING = 0.08
 MARKS = 4  # parts of the horizon whose ends are marked
@@ -35,8 +36,8 @@ def draw_plane(data: FigureData) -> Figure:
     views = [plane.view(data.path)]
     if (close := plane.goal(data.path)) is not None:
         views.append(close)
-    talls = [float(np.clip(look.WIDTH * (high - low)[1] / (high - low)[0], 2.0, 7.0)) for low, high in views]
-    figure = Figure(figsize=(look.WIDTH, sum(talls) + 0.6 + 0.5 * len(talls)), layout="constrained")
+    talls = [float(np.clip(look.FIGURE_WIDTH * (high - low)[1] / (high - low)[0], 2.0, 7.0)) for low, high in views]
+    figure = Figure(figsize=(look.FIGURE_WIDTH, sum(talls) + 0.6 + 0.5 * len(talls)), layout="constrained")
     axes = figure.subplots(len(views), squeeze=False, height_ratios=talls)[:, 0].tolist()
     for ax, (low, high) in zip(axes, views, strict=True):
         _draw_plane(ax, data, low, high)
@@ -61,7 +62,7 @@ def _draw_plane(ax: Axes, data: FigureData, low: Array, high: Array) -> None:
         if limit.is_final:
             goal = Polygon(allowed, fill=False, edgecolor=look.VERMILLION, linewidth=2.0, zorder=4)
             goal.set_label("terminal set")
-            if len(allowed) and np.ptp(allowed, axis=0).max() <= POINT * sides.max():
+            if len(allowed) and np.ptp(allowed, axis=0).max() <= MARKED_GOAL_SHARE * sides.max():
                 ax.plot(*allowed.mean(axis=0), "s", color=look.VERMILLION, fillstyle="none", markeredgewidth=2.0,
                         markersize=9, zorder=4, label="terminal set")  # fmt: skip
             else:

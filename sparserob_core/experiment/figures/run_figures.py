@@ -25,9 +25,10 @@ if TYPE_CHECKING:
 MAX_FAMILIES = 6  # in one figure: with twice as many panels it is longer than a page
 SLACK_POINTS = 2001  # of a curve: with a tenth peaks of long filters are corners, ten times as many are a megabyte
 MAX_GAINS = 16  # pictures of gains in one figure
-FLAT = 1.5  # half the least height of a switching function, in prices: at 15 the band is a line, at 1 it hides its edge
+# Half the least height of a switching function, in prices: at 15 the band is a line, at 1 it hides its edge
+MIN_SWITCHING_HEIGHT = 1.5
 HEADROOM = 1.15  # of the largest value, above it: at 1 it is on the frame, at 10 the band is a line
-IDLE = 1e-7  # of the control's bound: less than that is no action but rounding
+IDLE_SHARE_OF_BOUND = 1e-7  # of the control's bound: less than that is no action but rounding
 
 
 def run_pictures(data: FigureData) -> dict[str, Callable[[], Figure]]:
@@ -85,10 +86,10 @@ def draw_switching(data: FigureData) -> Figure:
     ends, edge = data.breakpoints, np.ones(data.breakpoints.size - 1)
     for channel, ax in enumerate(axes):
         values = data.switching[channel]
-        reach = max(FLAT, HEADROOM * float(np.abs(values).max()))
+        reach = max(MIN_SWITCHING_HEIGHT, HEADROOM * float(np.abs(values).max()))
         bound = max(abs(float(data.control_lower[channel])), abs(float(data.control_upper[channel])))
         size = np.abs(data.control[channel])
-        acts = size > IDLE * (bound if np.isfinite(bound) else float(size.max()))
+        acts = size > IDLE_SHARE_OF_BOUND * (bound if np.isfinite(bound) else float(size.max()))
         ax.stairs(np.where(acts, 2 * reach, 0.0) - reach, ends, baseline=-reach, fill=True, color=look.SKY, alpha=0.35,
                   linewidth=0, zorder=0, label="acts")  # fmt: skip
         ax.axhspan(-1.0, 1.0, color=look.MIST, alpha=0.6, linewidth=0, zorder=0.5, label="not worth its price")
@@ -241,7 +242,7 @@ def draw_effort(data: FigureData) -> Figure:
     ends, lengths = data.breakpoints, np.diff(data.breakpoints)
     largest = np.maximum(np.abs(data.control_least), np.abs(data.control_most))
     bound = np.maximum(np.abs(data.control_lower), np.abs(data.control_upper))
-    acts = largest > IDLE * np.where(np.isfinite(bound), bound, largest.max(axis=1))[:, None]
+    acts = largest > IDLE_SHARE_OF_BOUND * np.where(np.isfinite(bound), bound, largest.max(axis=1))[:, None]
     for channel, ax in enumerate(axes):
         low, middle, high = data.effort[:, channel]
         top = max(float(largest[channel].max()), 1e-9) * 1.12
@@ -273,7 +274,7 @@ def _make_grid(count: int, across: int) -> tuple[Figure, list[Axes]]:
     from matplotlib.figure import Figure
 
     down = -(-count // across)
-    width = look.WIDTH if across == 1 else 3.4 * across
+    width = look.FIGURE_WIDTH if across == 1 else 3.4 * across
     figure = Figure(figsize=(width, 2.6 * down + 1.0), layout="constrained")
     axes = figure.subplots(down, across, squeeze=False).ravel()
     for ax in axes[count:]:
@@ -292,7 +293,7 @@ def draw_slacks(program: SemiInfiniteProgram, result: Result, title: str) -> Fig
     families = families[:MAX_FAMILIES]
     if not families or result.decision is None:
         return None
-    figure = Figure(figsize=(look.WIDTH, 1.7 * len(families) + 0.75), layout="constrained")
+    figure = Figure(figsize=(look.FIGURE_WIDTH, 1.7 * len(families) + 0.75), layout="constrained")
     for ax, family in zip(figure.subplots(len(families), 1, squeeze=False)[:, 0], families, strict=True):
         corners = _corners(family)
         axis = int(np.ptp(corners, axis=0).argmax())

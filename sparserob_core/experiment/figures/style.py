@@ -28,8 +28,12 @@ INK, GREY, MIST = "#222222", "#7A7A7A", "#E9E9E9"
 EXCLUDED: dict[str, Any] = {"facecolor": MIST, "edgecolor": "#C4C4C4", "hatch": "////", "linewidth": 0, "zorder": 0}
 """How an area is drawn in which nothing may be, or nothing is."""
 
-WIDTH = 6.2
+FIGURE_WIDTH = 6.2
 """Width of every figure in inches: a text column at full size."""
+
+VIEW_BELOW_OPTIMUM = 1.5
+"""The view of a bound reaches down by this many times the size of the optimum; first bounds of a search may be far
+below."""
 
 LETTERS, MARKER_LETTERS = 104, 8
 """Letters that have room beside each other in a legend, and as how many of them a mark with its spaces is as wide: with
@@ -86,7 +90,7 @@ def panels(rows: int, height: float, *, extra: float = 0.0) -> tuple[Figure, lis
     legends."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(WIDTH, rows * height + 0.75 + extra), layout="constrained")
+    figure = Figure(figsize=(FIGURE_WIDTH, rows * height + 0.75 + extra), layout="constrained")
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
     return figure, list(axes)
 

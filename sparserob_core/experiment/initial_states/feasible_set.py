@@ -16,7 +16,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.result import Status
 
-ROUNDING = 1e-12  # of a bound
+BOUND_ROUNDING = 1e-12  # of a bound
 ON_EDGE = 1e-9  # of the polygon's size, a distance that is on the edge
 
 
@@ -104,7 +104,7 @@ class InitialStates:
         if not self.outer.shape[0]:
             return "outside" if self.status == "infeasible" else "open"
         term_sizes = np.abs(self.directions) @ np.abs(self.outer).max(axis=0)  # what is added up to a bound
-        if (self.directions @ x > self.bounds + ROUNDING * np.maximum(term_sizes, np.abs(self.bounds))).any():
+        if (self.directions @ x > self.bounds + BOUND_ROUNDING * np.maximum(term_sizes, np.abs(self.bounds))).any():
             return "outside"
         return "inside" if self.inner.shape[0] > 2 and bool(inside(self.inner, x[None])[0]) else "open"
 

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 LEVELS = 12  # bands of colour, about
 COLOURS = "viridis"  # perceptually uniform, and one for eyes that see fewer colours (Smith and van der Walt 2015)
-MARGIN = 0.07  # of the set's extent, around it
+SET_MARGIN = 0.07  # of the set's extent, around it
 HEIGHT = 5.3
-REACH = 0.35  # of the set's extent: an initial state that is no further away than this is in the picture
-FLAT = 1e-6  # of the picture, the least extent of a set that is drawn as one with interior
+PICTURE_DISTANCE = 0.35  # of the set's extent: an initial state that is no further away than this is in the picture
+MIN_DRAWN_EXTENT = 1e-6  # of the picture, the least extent of a set that is drawn as one with interior
 
 
 def draw_initial_states(found: InitialStates) -> Figure:
@@ -31,17 +31,19 @@ def draw_initial_states(found: InitialStates) -> Figure:
     initial state."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(look.WIDTH, HEIGHT), layout="constrained")
+    figure = Figure(figsize=(look.FIGURE_WIDTH, HEIGHT), layout="constrained")
     ax = figure.subplots()
     low, high = found.outer.min(axis=0), found.outer.max(axis=0)
     extent = np.maximum(high - low, 0.05 * np.abs(found.outer).max(axis=0) + np.finfo(float).tiny)
-    near = (found.start >= low - REACH * extent).all() and (found.start <= high + REACH * extent).all()
+    near = (found.start >= low - PICTURE_DISTANCE * extent).all() and (
+        found.start <= high + PICTURE_DISTANCE * extent
+    ).all()
     if near:
         low, high = np.minimum(low, found.start), np.maximum(high, found.start)
-    middle, half = (low + high) / 2, np.maximum(high - low, extent) * (0.5 + MARGIN)
+    middle, half = (low + high) / 2, np.maximum(high - low, extent) * (0.5 + SET_MARGIN)
     ax.set_xlim(middle[0] - half[0], middle[0] + half[0])
     ax.set_ylim(middle[1] - half[1], middle[1] + half[1])
-    if (np.ptp(found.outer, axis=0) > FLAT * extent).all() and found.inner.shape[0] > 2:
+    if (np.ptp(found.outer, axis=0) > MIN_DRAWN_EXTENT * extent).all() and found.inner.shape[0] > 2:
         _draw_costs(figure, ax, found)
     elif found.costs.size:
         _draw_colour_bar(

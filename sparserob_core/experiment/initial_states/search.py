@@ -31,11 +31,12 @@ from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.result import Result
 
-ROOM = 1.1  # the box of coordinates, relative to what is proven to contain the set: its sides must not matter
+# The box of coordinates, relative to what is proven to contain the set: its sides must not matter
+COORDINATE_BOX_FACTOR = 1.1
 FRAMES = 4  # boxes at most, each fitted to the set by the last one
 SLIVER = 1e-9  # of the box in area: a set without interior
-CLOSED = 1e-3  # of the area: a difference of the polygons that is called none
-ASIDE = 1e-3  # how far costs are measured within the vertices, where no control has any room
+CLOSED_AREA_SHARE = 1e-3  # of the area: a difference of the polygons that is called none
+COST_INSET = 1e-3  # how far costs are measured within the vertices, where no control has any room
 PROVEN = ("certified", "verified")
 
 
@@ -97,7 +98,7 @@ class InitialStatesSearch:
             self._report_progress("direction", len(framed), directions)
             with self.tools.deadline.enforced():
                 supports = sandwich(
-                    self._explore_direction, framed, 0 if self.interrupted else directions, 0.1 * CLOSED
+                    self._explore_direction, framed, 0 if self.interrupted else directions, 0.1 * CLOSED_AREA_SHARE
                 )
         except KeyboardInterrupt as pressed:
             self._note_interrupt(pressed)
@@ -123,7 +124,7 @@ class InitialStatesSearch:
         share = 1.0 - polygon_area(inner) / size
         return self._finish_result(
             feasible_set,
-            status="certified" if share <= CLOSED else "verified",
+            status="certified" if share <= CLOSED_AREA_SHARE else "verified",
             message=f"between two polygons, both proven{self._restriction}, that differ by {share:.2%} of the area",
         )
 
@@ -192,7 +193,7 @@ class InitialStatesSearch:
             fits = (high - low > 1.0) | (self.plane.radius <= least)
             if number == FRAMES - 1 or (number and fits.all()):
                 return supports
-            middle, half = (lower + upper) / 2, np.maximum(ROOM * (upper - lower) / 2, least)
+            middle, half = (lower + upper) / 2, np.maximum(COORDINATE_BOX_FACTOR * (upper - lower) / 2, least)
             self.plane = self.plane.resized(np.maximum(middle - half, -limit), np.minimum(middle + half, limit))
         raise AssertionError("the last frame returns")
 
@@ -275,10 +276,10 @@ def _make_lattice(inner: Array, values: int) -> Array:
     if not values or not inner.shape[0]:
         return np.zeros((0, 2))
     middle = inner.mean(axis=0)
-    corners = middle + (1.0 - ASIDE) * (inner - middle)
+    corners = middle + (1.0 - COST_INSET) * (inner - middle)
     if polygon_area(inner) <= SLIVER:
         ends = inner[[0, int(np.linalg.norm(inner - inner[0], axis=1).argmax())]]
-        return np.asarray(ends[0] + np.linspace(ASIDE, 1.0 - ASIDE, values)[:, None] * (ends[1] - ends[0]))
+        return np.asarray(ends[0] + np.linspace(COST_INSET, 1.0 - COST_INSET, values)[:, None] * (ends[1] - ends[0]))
     sides = [
         np.linspace(low, high, values + 2)[1:-1] for low, high in zip(inner.min(axis=0), inner.max(axis=0), strict=True)
     ]

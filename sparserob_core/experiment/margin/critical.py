@@ -23,8 +23,8 @@ from sparserob_core.sip.relaxed.parametric import ParametricProgram, extreme_pro
 from sparserob_core.sip.working.ledger import unproven
 from sparserob_core.sip.working.scaled import largest_factor, least_slack
 
-ROOM = 1e3  # bounds of the slack, in units of the violation without control
-PROBES = 80  # largest number of factors at which the slack is computed
+SLACK_BOUND = 1e3  # bounds of the slack, in units of the violation without control
+MAX_FACTORS = 80  # largest number of factors at which the slack is computed
 
 
 @final
@@ -189,7 +189,7 @@ def _bound_slack(program: SemiInfiniteProgram) -> tuple[float, float]:
     violations = [
         float(family.worst(origin).violations.max()) for family in program.families if family.worst is not None
     ]
-    size = ROOM * (1.0 + max(map(abs, violations), default=0.0))
+    size = SLACK_BOUND * (1.0 + max(map(abs, violations), default=0.0))
     return -size, size
 
 
@@ -202,7 +202,7 @@ def _bracket_root(
     halved where this stalls.
     """
     stalled = 0
-    for _ in range(PROBES):
+    for _ in range(MAX_FACTORS):
         span = abs(bad[0] - good[0])
         if span <= 0.5 * width:
             break

@@ -17,11 +17,11 @@ from sparserob_core.experiment.plugins.messages import nearest
 from sparserob_core.sip.convex_set import Array
 
 Sense: TypeAlias = Literal["largest", "smallest"]
-LARGEST = 1e6  # the largest factor that is tried
+LARGEST_FACTOR = 1e6  # the largest factor that is tried
 MAX_UNCERTAIN = 1024.0  # the largest factor on a set of parameters, which changes the matrices
 CONTROL = "factor on the control set"
-SHORT = 1e-9  # share of a window that must remain where a control is held over several intervals in it
-POINT = 1e-6  # the factor that replaces 0 for a curved set, which must have an interior
+MIN_WINDOW_SHARE = 1e-9  # share of a window that must remain where a control is held over several intervals in it
+MIN_CURVED_FACTOR = 1e-6  # the factor that replaces 0 for a curved set, which must have an interior
 
 
 @final
@@ -56,7 +56,7 @@ class Scaling:
     quantity: str
     amount: Callable[[float], float]
     affine: bool = True
-    highest: float = LARGEST
+    highest: float = LARGEST_FACTOR
     relative: bool = True
     """Whether the factor multiplies a quantity; otherwise it is itself an amount of ``quantity``: a time."""
     nested: bool = True
@@ -261,7 +261,7 @@ def _shift_window(problem: OptimalControlProblem, path: str, positions: Sequence
     paths = problem.windows
     latest = min(problem.horizon if paths[i].stop is None else float(paths[i].stop or 0.0) for i in positions)
     if any(paths[i].lasting for i in positions):
-        latest *= 1.0 - SHORT
+        latest *= 1.0 - MIN_WINDOW_SHARE
     for i in positions:
         rows = paths[i].relative_to
         if rows is not None and np.asarray(rows)[0, 0] > 0.0:
@@ -310,7 +310,7 @@ def _make_scaler(of: str, value: Any) -> Callable[[float], Any]:
     reach = bound.support(np.vstack([np.eye(bound.dimension), -np.eye(bound.dimension)]))
     if not (np.isinf(reach) | (reach != np.concatenate([middle, -middle]))).any():
         raise InputError(f"of: {of} is a single point, which no factor enlarges; expected a set with an extent")
-    least = 0.0 if bound.halfspaces() is not None else POINT
+    least = 0.0 if bound.halfspaces() is not None else MIN_CURVED_FACTOR
     return lambda factor: value.scaled(max(factor, least))
 
 

@@ -10,7 +10,7 @@ from sparserob_core.errors import PluginError, SparseRobError, named
 from sparserob_core.sip.maximiser import SearchEnded
 
 Answer = TypeVar("Answer")
-SHOWN = 80
+MAX_ANSWER_LETTERS = 80  # of an answer of a plugin in a message
 PASSING = (SparseRobError, SearchEnded)  # errors with a message of their own
 
 
@@ -68,4 +68,4 @@ def short_repr(value: object) -> str:
         text = " ".join(repr(value).split())
     except Exception:  # noqa: BLE001  a foreign repr may raise anything
         text = f"a {type(value).__name__}"
-    return text if len(text) <= SHOWN else text[: SHOWN - 3] + "..."
+    return text if len(text) <= MAX_ANSWER_LETTERS else text[: MAX_ANSWER_LETTERS - 3] + "..."

@@ -16,7 +16,7 @@ from sparserob_core.errors import InputError, Path, dotted
 if TYPE_CHECKING:
     from pydantic import ValidationError
 
-SHOWN = 60
+MAX_INPUT_LETTERS = 60  # of a value of a config in a message
 COMPLAINT = "complaint"  # the type of an error whose message is already the sentence to be shown
 MUST_BE = {
     "model_type": "a mapping",
@@ -57,7 +57,7 @@ def shown(value: object) -> str:
     """Return a short text of a value, in the words of a config."""
     value = as_utf8(value) if isinstance(value, str) else value
     text = {"None": "null", "True": "true", "False": "false"}.get(repr(value), repr(value))
-    return text if len(text) <= SHOWN else text[: SHOWN - 3] + "..."
+    return text if len(text) <= MAX_INPUT_LETTERS else text[: MAX_INPUT_LETTERS - 3] + "..."
 
 
 def nearest(name: str, known: Iterable[str], below: Iterable[str] = ()) -> str:

@@ -47,7 +47,7 @@ Group: TypeAlias = Callable[[], Mapping[str, Picture]]
 
 logger = logging.getLogger("sparserob")
 
-SECONDS = 2.0
+LANDSCAPE_VALUE_SECONDS = 2.0
 """Seconds for the values of a landscape, after those of its coarsest grid, and for the tuples of the search that are
 evaluated once more. With a tenth of it the figure is coarse, and the trajectory of the search begins in its middle. Ten
 times as many seconds are more than a user waits for."""
@@ -175,13 +175,13 @@ def _prepare_decision_figures(
     That of the worst cases is among them unless there is no constraint against which they could be driven.
     """
     from sparserob_core.experiment.figures.adversary_figure import draw_adversary
-    from sparserob_core.experiment.figures.drawing import DRAWS, choose_states, figure_data
+    from sparserob_core.experiment.figures.drawing import QUANTILE_DRAWS, choose_states, figure_data
     from sparserob_core.experiment.figures.run_figures import run_pictures
 
     assert experiment.model is not None
     decision = np.asarray(result.decision, dtype=float).ravel()
     active, states = active_of(experiment.model, result.indices), choose_states(experiment, decision)
-    data = figure_data(experiment, decision, active, result.history, result.cost, DRAWS, result.status, states)
+    data = figure_data(experiment, decision, active, result.history, result.cost, QUANTILE_DRAWS, result.status, states)
     data = replace(data, switching=switching(experiment, result))
     cases = worst(decision)
     return {**run_pictures(data), **({"adversary": partial(draw_adversary, cases, data)} if cases else {})}
@@ -301,7 +301,7 @@ def landscape_of(
 
     Notes
     -----
-    The grid is refined until `SECONDS` are over; the finest complete grid is returned.
+    The grid is refined until `LANDSCAPE_VALUE_SECONDS` are over; the finest complete grid is returned.
     """
     evaluations = np.flatnonzero(trace.epsilon == trace.epsilon[-1]) if trace.epsilon.size else np.empty(0, dtype=int)
     evaluations = evaluations[np.isfinite(trace.value[evaluations])]
@@ -351,7 +351,10 @@ def landscape_of(
     coordinates, (across, up, values) = list(g.coordinates), landscape.shown
     widths = (g.slot.upper - g.slot.lower)[coordinates]
     slots = deciding_slots(
-        deciding_again(g, trace.points[evaluations], notes, SECONDS), tuples[:, :, coordinates], widths, pair
+        deciding_again(g, trace.points[evaluations], notes, LANDSCAPE_VALUE_SECONDS),
+        tuples[:, :, coordinates],
+        widths,
+        pair,
     )
     places = tuples[:, :, coordinates][np.arange(evaluations.size)[:, np.newaxis], slots]
     visited = axes.of(tuple(coordinates), places)
@@ -378,7 +381,7 @@ def _fill_landscape(landscape: Landscape, notify: Notify) -> None:
         if complete:
             size = " x ".join(str(axis.size) for axis in landscape.shown[:2])
             notify(StudyProgress(text=f"figures: the landscape of g on {size}"))
-        if landscape.level and time.monotonic() - start > SECONDS:
+        if landscape.level and time.monotonic() - start > LANDSCAPE_VALUE_SECONDS:
             return
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
     from sparserob_core.sip.result import Result
 
-KEPT = 2**22
+MAX_ROW_NUMBERS_KEPT = 2**22
 """Numbers of rows that are kept for a map, by family, 32 MiB. With a tenth the rows of its lines are built again and
 again where the horizon has a thousand pieces; with ten times as many, watching takes the memory of another run."""
 CoordinateKind: TypeAlias = Literal["time", "parameter", "disturbance", "direction", "index"]
@@ -395,13 +395,14 @@ def _substitute_worst(family: ConstraintFamily, coefficients: np.ndarray) -> Con
 
 
 def _remember_rows(family: ConstraintFamily) -> ConstraintFamily:
-    """Return a family that keeps up to `KEPT` numbers of its rows: the indices of a map lie on a few lines."""
+    """Return a family that keeps up to `MAX_ROW_NUMBERS_KEPT` numbers of its rows: the indices of a map lie on a few
+    lines."""
     build, by_index = family.rows, dict[bytes, tuple[Array, Array]]()
 
     def rows(indices: Array) -> tuple[Array, Array]:
         keys = [index.tobytes() for index in indices]
         size = next(iter(by_index.values()))[0].size if by_index else 0
-        if (len(by_index) + len(keys)) * size > KEPT:
+        if (len(by_index) + len(keys)) * size > MAX_ROW_NUMBERS_KEPT:
             by_index.clear()
         places = {key: k for k, key in enumerate(keys) if key not in by_index}
         if places:

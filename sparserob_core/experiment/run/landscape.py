@@ -26,10 +26,10 @@ COARSEST = 16
 """The stride before those of `STRIDES` where each value is a robust program of its own. It gives sixteen values, which
 take a second. With twice as large a stride there is hardly more than the corners. With half of it 36 values are not
 complete when a run of two seconds ends on a busy machine."""
-FLAT = 1e-9  # relative to g: smaller differences are errors of the solver
-CLOSE = 0.01  # of the distance of two lines of the grid
+FLAT_GAIN_SHARE = 1e-9  # relative to g: smaller differences are errors of the solver
+SAME_LINE_SHARE = 0.01  # of the distance of two lines of the grid
 
-PROBES = 5
+VALUES_PER_COORDINATE = 5
 """Values of a coordinate at which the change of g along it is measured. With two of them a ridge between the ends stays
 hidden; with fifty the choice of the axes takes as long as a map."""
 
@@ -39,7 +39,7 @@ Axis: TypeAlias = tuple[int, int]
 """The axis of a map: ``(rank, coordinate)`` of the index that decides most (rank 0) or of the other one (rank 1)."""
 Reach: TypeAlias = tuple[float, float]
 """The change of g along an axis: the share of the axis on which g is infinite, and the range of its finite values."""
-NEAR = 0.05
+SAME_CONSTRAINT_DISTANCE = 0.05
 """Indices that are nearer to one another, in widths of the box, stand for one constraint and move together. With a
 tenth of it, two close indices of a search hide that g depends on them. With ten times it, all indices are one."""
 
@@ -49,8 +49,8 @@ tenth of it, two close indices of a search hide that g depends on them. With ten
 class Landscape:
     """A map of g on a plane through a tuple, over two of its coordinates.
 
-    An index that is `NEAR` to one of the two that move stands for the same constraint and moves with it. The
-    disturbance of every index that moves is the worst one.
+    An index nearer than `SAME_CONSTRAINT_DISTANCE` to one of the two that move stands for the same constraint and moves
+    with it. The disturbance of every index that moves is the worst one.
 
     Parameters
     ----------
@@ -117,7 +117,8 @@ class Landscape:
         self.values = np.full((self.axes[0].size, self.axes[1].size), np.nan)
 
     def _find_head(self, slot: int, heads: tuple[int, int]) -> int:
-        """Return the head to which an index is `NEAR` and with which it moves; -1 where there is none."""
+        """Return the head within `SAME_CONSTRAINT_DISTANCE` of an index, with which it moves; -1 where there is
+        none."""
         widths = np.where(self.g.slot.upper > self.g.slot.lower, self.g.slot.upper - self.g.slot.lower, np.inf)
         distances = {
             head: (np.abs(self.anchor[slot] - self.anchor[head]) / widths)[~self._disturbance_mask].max()
@@ -126,7 +127,7 @@ class Landscape:
         if not self.g.interchangeable:
             return slot if slot in heads else -1
         nearest = slot if slot in heads else min(heads, key=lambda head: distances[head])
-        return nearest if distances[nearest] < NEAR else -1
+        return nearest if distances[nearest] < SAME_CONSTRAINT_DISTANCE else -1
 
     def _make_axis(self, place: Place) -> tuple[Array, np.ndarray, np.ndarray]:
         """Return the values along an axis, those of them in the even grid, and those of the anchor.
@@ -140,7 +141,7 @@ class Landscape:
         )
         for value in anchor_values:
             nearest = int(np.abs(even - value).argmin())
-            if abs(even[nearest] - value) < CLOSE * (even[-1] - even[0]) / self.grid:
+            if abs(even[nearest] - value) < SAME_LINE_SHARE * (even[-1] - even[0]) / self.grid:
                 even[nearest] = value
         values = np.union1d(even, anchor_values)
         return values, np.searchsorted(values, even), np.searchsorted(values, anchor_values)
@@ -236,7 +237,7 @@ class Landscape:
     def flat(self) -> bool:
         """True where ``g`` is the same everywhere on the complete grid."""
         low, high = self.limits
-        return bool(np.isfinite(self.shown[2]).all() and high - low <= FLAT * max(1.0, abs(high)))
+        return bool(np.isfinite(self.shown[2]).all() and high - low <= FLAT_GAIN_SHARE * max(1.0, abs(high)))
 
     def picture(self, size: int) -> Array:
         """Return the values ``(size, size)`` at the centres of even cells, by linear interpolation of those that are
@@ -360,7 +361,7 @@ class LandscapeAxes:
         axes = axes_of(g, 1 if pair[0] == pair[1] else 2)
         for rank, c in axes if len(axes) > 2 else ():
             other_axis = next((r, k) for r, k in axes if (r, k) != (rank, c))
-            line = Landscape(g, anchor, (pair[rank], c), (pair[other_axis[0]], other_axis[1]), PROBES)
+            line = Landscape(g, anchor, (pair[rank], c), (pair[other_axis[0]], other_axis[1]), VALUES_PER_COORDINATE)
             yield from line.cross()
             reach[rank, c] = line.reach
 
@@ -477,7 +478,7 @@ def two_of(ranked: Sequence[int] | np.ndarray, slots: Array, widths: Array, othe
         The two indices; the same one twice where there is only one.
     """
     first, *lower_ranked = [int(k) for k in ranked if k >= 0] or [int(others[0])]
-    distinct = [k for k in lower_ranked if np.abs((slots[k] - slots[first]) / widths).max() > NEAR]
+    distinct = [k for k in lower_ranked if np.abs((slots[k] - slots[first]) / widths).max() > SAME_CONSTRAINT_DISTANCE]
     second = next((k for k in (*distinct, *others, *lower_ranked, *range(len(slots))) if k != first), first)
     return first, int(second)
 
@@ -503,7 +504,10 @@ def deciding_slots(deciding: np.ndarray, tuples: Array, widths: Array, pair: tup
     """
     rows, first = np.arange(len(tuples)), deciding[:, 0]
     heads = tuples[rows, first]  # of a row in which nothing decides it is any index, and not used
-    is_distinct = np.abs((tuples[rows[:, np.newaxis], deciding] - heads[:, np.newaxis]) / widths).max(axis=2) > NEAR
+    is_distinct = (
+        np.abs((tuples[rows[:, np.newaxis], deciding] - heads[:, np.newaxis]) / widths).max(axis=2)
+        > SAME_CONSTRAINT_DISTANCE
+    )
     is_distinct &= deciding >= 0
     second = np.where(is_distinct.any(axis=1), deciding[rows, is_distinct.argmax(axis=1)], -1)
     pairs = list[tuple[int, int]]()

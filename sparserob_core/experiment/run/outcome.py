@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from sparserob_core.control.studies.causal import CausalBound
 
-ROWS = 4  # of the table of a run, which `repr` shows
+REPR_ROWS = 4  # of the table of a run, which `repr` shows
 HEADING = "Complete and resolved. To repeat the run: sparserob run config.yaml"
 COMPONENTS = ("method", "maximiser", "solver", "regulariser", "policy")
 
@@ -387,7 +387,7 @@ class Outcome:
         return self.result
 
     def __repr__(self) -> str:
-        lines = [f"  {name}: {value}" for name, value in result_rows(self.summary)[:ROWS]]
+        lines = [f"  {name}: {value}" for name, value in result_rows(self.summary)[:REPR_ROWS]]
         return "\n".join([f"Outcome of {self.experiment.title!r} in {self.directory}", *lines])
 
     def _repr_html_(self) -> str:

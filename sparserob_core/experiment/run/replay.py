@@ -27,7 +27,7 @@ BATCHES = 100  # into which the evaluations of a run are divided
 DECIDING_SECONDS = 10.0
 """Seconds in which the tuples of one search are evaluated once more. With a tenth of it the trajectory of a search of
 some thousand evaluations would begin in its middle. Ten times as many seconds are more than a user waits for."""
-PATIENCE = 60.0  # seconds that the landscape may take
+LANDSCAPE_SECONDS = 60.0  # seconds that the landscape may take
 
 
 def replay(
@@ -87,7 +87,7 @@ def play(
     event_stream: Iterator[Event], *, save: str | Path | None, serve: bool, connect: str | None
 ) -> tuple[str, ...]:
     """Send events to a recorder, and return the sentence that says what was recorded."""
-    observer = recorder(save, serve, connect, PATIENCE)
+    observer = recorder(save, serve, connect, LANDSCAPE_SECONDS)
     try:
         for event in event_stream:
             observer.receive(event)

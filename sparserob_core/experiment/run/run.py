@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sparserob_core.control.transcription.provable import SECONDS, announced, unprovable
+from sparserob_core.control.transcription.provable import UNPROVABLE_SECONDS, announced, unprovable
 from sparserob_core.errors import InputError, SparseRobError, named
 from sparserob_core.experiment.assemble import Anew, UntranscribedExperiment, assemble_in_time, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
@@ -131,7 +131,10 @@ def _run(
         return _write_untranscribed(experiment, origin, out)
     why = None if experiment.problem is None else unprovable(experiment.problem)
     if why is not None:
-        deadline, why = (deadline if deadline.bounded else Deadline(SECONDS)), announced(why, deadline.bounded)
+        deadline, why = (
+            (deadline if deadline.bounded else Deadline(UNPROVABLE_SECONDS)),
+            announced(why, deadline.bounded),
+        )
     tools = replace(tools, deadline=deadline)
     watching = [*_build_observers(loaded), *((type(observer).__name__, observer) for observer in observers)]
     method: Method = build(loaded, "method", loaded.config.method)

@@ -213,13 +213,13 @@ def _warn_unprovable(problem: OptimalControlProblem, deadline: Deadline) -> Dead
 
     Returns the deadline, which is then bounded, so that the search for a witness ends.
     """
-    from sparserob_core.control.transcription.provable import SECONDS, announced, unprovable
+    from sparserob_core.control.transcription.provable import UNPROVABLE_SECONDS, announced, unprovable
 
     reason = unprovable(problem)
     if reason is None:
         return deadline
     logger.warning("no control of this problem can be certified: %s", announced(reason, deadline.bounded))
-    return deadline if deadline.bounded else Deadline(SECONDS)
+    return deadline if deadline.bounded else Deadline(UNPROVABLE_SECONDS)
 
 
 def _get_name(choice: object) -> str:

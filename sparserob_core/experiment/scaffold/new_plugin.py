@@ -20,7 +20,7 @@ from sparserob_core.experiment.plugins.hookspecs import record_type
 from sparserob_core.experiment.plugins.records import RECORDS
 from sparserob_core.experiment.plugins.registry import load_registry
 
-LONGEST = 30  # letters of a name: lines of the templates stay within 120 columns
+MAX_NAME_LETTERS = 30  # letters of a name: lines of the templates stay within 120 columns
 PACKAGE = "package"
 RULES = ("schedule", "outer_stop", "inner_stop", "selection")  # what they are called with differs
 HEADING = re.compile(r"^#### (\S+)\n", re.MULTILINE)
@@ -74,10 +74,11 @@ def kinds() -> list[str]:
 
 def _check_name(kind: str, name: str) -> None:
     quoted_name = f"{name!r}"
-    if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or len(name) > LONGEST:
+    if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or len(name) > MAX_NAME_LETTERS:
         raise InputError(
             path="name",
-            expected=f"lower-case letters, digits and single underscores, a letter first, at most {LONGEST} of them",
+            expected="lower-case letters, digits and single underscores, a letter first, "
+            f"at most {MAX_NAME_LETTERS} of them",
             got=quoted_name,
         )
     registry = load_registry()

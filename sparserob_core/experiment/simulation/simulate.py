@@ -50,7 +50,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.program import TOLERANCE
 
-TRAJECTORIES = 10_000
+TRAJECTORIES = 10_000  # that are drawn unless stated otherwise: a probability is known to about 0.01
 FAN, SHOWN = 120, 400  # numbers of trajectories and of times that are kept for the figure
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from sparserob_core.brief import brief
 from sparserob_core.sip.convex_set import Array
 
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # of the interval of the probability of a violation
 PROVEN = frozenset({"certified", "verified"})
 ADVERSARY = "adversary"
 ANY = "any of them"

@@ -16,7 +16,7 @@ from sparserob_core.experiment.config.reading.reader import read_value
 from sparserob_core.experiment.config.run_config import SLOTS
 from sparserob_core.experiment.plugins.messages import shown
 
-MAX_POINTS = 100_000
+MAX_STUDY_POINTS = 100_000
 """Largest number of values of an axis, and of points of a study."""
 FIXED = (*IRRELEVANT, "plugins")
 """Keys that all points of a study have in common, and whose lists are single values."""
@@ -258,10 +258,14 @@ def _parse_entry(key: str, part: str, of: int) -> object:
 
 def _expand_range(key: str, part: str, found: re.Match[str]) -> list[float] | list[int]:
     low, high, log = float(found[2]), float(found[3]), bool(found[1])
-    if not WHOLE.fullmatch(found[4]) or not 1 <= int(found[4]) <= MAX_POINTS or (int(found[4]) == 1 and low != high):
+    if (
+        not WHOLE.fullmatch(found[4])
+        or not 1 <= int(found[4]) <= MAX_STUDY_POINTS
+        or (int(found[4]) == 1 and low != high)
+    ):
         raise InputError(
             path=key,
-            expected=f"a whole number of values at the end of {shown(part)}, from 2 to {MAX_POINTS}",
+            expected=f"a whole number of values at the end of {shown(part)}, from 2 to {MAX_STUDY_POINTS}",
             got=found[4],
         )
     count = int(found[4])
@@ -294,8 +298,8 @@ def _check_ends(key: str, part: str, low: float, high: float, log: bool) -> None
 
 
 def _check_values(key: str, values: tuple[Any, ...]) -> tuple[Any, ...]:
-    if not 1 <= len(values) <= MAX_POINTS:
-        raise InputError(path=key, expected=f"1 to {MAX_POINTS} values", got=str(len(values)))
+    if not 1 <= len(values) <= MAX_STUDY_POINTS:
+        raise InputError(path=key, expected=f"1 to {MAX_STUDY_POINTS} values", got=str(len(values)))
     reprs = set[str]()
     for value in values:
         if repr(value) in reprs:

@@ -33,8 +33,8 @@ MARKS: Mapping[str, str] = {
 }
 """Marker of each status."""
 FILLED = "osDvX"
-LETTERS = 44  # largest length of a label
-CELLS = 5  # number of values of each axis from which a map is clearer than curves
+MAX_LABEL_LETTERS = 44  # largest length of a label
+MIN_MAP_VALUES = 5  # number of values of each axis from which a map is clearer than curves
 SEVERAL = 5  # number of seeds from which a box is clearer than points
 
 
@@ -55,7 +55,7 @@ def draw_study(study: Study) -> Figure:
     if (
         len(numeric) == 2
         and not categorical
-        and (drawn or min(_count_values(study, axis) for axis in numeric) >= CELLS)
+        and (drawn or min(_count_values(study, axis) for axis in numeric) >= MIN_MAP_VALUES)
     ):
         return _draw_map(study, numeric)
     if numeric:
@@ -79,7 +79,7 @@ def _group_rows(rows: Sequence[Row], axes: Sequence[Axis]) -> dict[str, list[Row
     for row in rows:
         alone = len(axes) == 1 and not axes[0].numeric
         label = ", ".join(value_text(row[axis.key]) if alone else _name_value(axis, row[axis.key]) for axis in axes)
-        groups.setdefault(plain(shorten(label, LETTERS, placeholder="...")) if axes else "", []).append(row)
+        groups.setdefault(plain(shorten(label, MAX_LABEL_LETTERS, placeholder="...")) if axes else "", []).append(row)
     return groups
 
 
@@ -149,7 +149,7 @@ def _draw_map(study: Study, axes: Sequence[Axis]) -> Figure:
     from matplotlib.figure import Figure
 
     first, second = axes
-    figure = Figure(figsize=(look.WIDTH, 3.9), layout="constrained")
+    figure = Figure(figsize=(look.FIGURE_WIDTH, 3.9), layout="constrained")
     ax = figure.subplots()
     cells: dict[tuple[float, float], list[Row]] = {}
     for row in study.table:
@@ -198,7 +198,7 @@ def _draw_categories(study: Study, axes: Sequence[Axis]) -> Figure:
     from matplotlib.figure import Figure
 
     groups = _group_rows(study.table, axes)
-    figure = Figure(figsize=(look.WIDTH, 0.32 * len(groups) + 1.6), layout="constrained")
+    figure = Figure(figsize=(look.FIGURE_WIDTH, 0.32 * len(groups) + 1.6), layout="constrained")
     left_ax, right_ax = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     for position, rows in enumerate(groups.values()):
         shift = np.linspace(-0.22, 0.22, len(rows)) if len(rows) > 1 else np.zeros(1)
@@ -269,7 +269,7 @@ def _finish_figure(figure: Figure, ax: Axes, study: Study, has_labels: bool, mar
             )
         )
         labels.append(status)
-    columns = 2 if any(len(label) > LETTERS // 2 for label in labels) else 4
+    columns = 2 if any(len(label) > MAX_LABEL_LETTERS // 2 for label in labels) else 4
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, columnspacing=1.6, handlelength=1.8)
 
 

@@ -22,13 +22,13 @@ from sparserob_core.experiment.config.reading.overrides import parse_overrides
 from sparserob_core.experiment.config.reading.reader import ConfigSource, read_source, read_value, write_yaml
 from sparserob_core.experiment.plugins.messages import nearest, shown
 from sparserob_core.experiment.run.events import StudyProgress
-from sparserob_core.experiment.sweep.axes import FIXED, MAX_POINTS, Axis, parse_axes, require_whole
+from sparserob_core.experiment.sweep.axes import FIXED, MAX_STUDY_POINTS, Axis, parse_axes, require_whole
 from sparserob_core.sip.events import Notify, ignore
 
 FILE = "sweep.yaml"
 HEADING = "A study. To go on with it, or to repeat it elsewhere: sparserob sweep sweep.yaml --out DIRECTORY"
 KEYS = ("base", "overrides", "axes", "points", "number", "seed")
-OFTEN = 100  # number of configs between two reports of their check
+CONFIGS_PER_REPORT = 100  # number of configs between two reports of their check
 Arrangement = Literal["grid", "zip", "random", "sobol"]
 ARRANGEMENTS: tuple[Arrangement, ...] = ("grid", "zip", "random", "sobol")
 
@@ -116,7 +116,7 @@ class Plan:
                 counts_text = ", ".join(f"{count} of {key}" for key, count in counts.items())
                 raise InputError(path="zip", expected="axes with equally many values", got=counts_text)
             return list(zip(*(axis.values for axis in self.axes), strict=True)) if self.axes else [()]
-        places = list(product(*(range(len(axis.values)) for axis in self._list_leading_axes(MAX_POINTS))))
+        places = list(product(*(range(len(axis.values)) for axis in self._list_leading_axes(MAX_STUDY_POINTS))))
         return [self._get_values(row) for row in places]
 
     def _list_leading_axes(self, max_points: float = np.inf) -> list[Axis]:
@@ -125,7 +125,7 @@ class Plan:
         leading = [axis for axis in self.axes if not axis.follows]
         count = int(np.prod([len(axis.values) for axis in leading], dtype=float))
         if count > max_points:
-            raise InputError(path="axes", expected=f"at most {MAX_POINTS} points", got=str(count))
+            raise InputError(path="axes", expected=f"at most {MAX_STUDY_POINTS} points", got=str(count))
         return leading
 
     def _get_values(self, places: Sequence[int]) -> tuple[Any, ...]:
@@ -166,7 +166,7 @@ class Plan:
         for values in rows:
             plain = self.loaded(values).config.plain()
             points.append(Point(values, json.dumps(plain), identity(plain)))
-            if len(points) % OFTEN == 0:
+            if len(points) % CONFIGS_PER_REPORT == 0:
                 text = f"{len(points)} of {len(rows)} configs are checked"
                 notify(StudyProgress(text=text, done=len(points), total=len(rows)))
         return points

@@ -21,8 +21,8 @@ from sparserob_core.experiment.run.run import run_loaded
 from sparserob_core.sip.limits.deadline import OutOfTime
 from sparserob_core.sip.solver import QuadraticProgram
 
-ACCURACY = 1e-6  # of a program that is solved only so that its imports are made
-TRIES = 5  # attempts to rename a directory while another process may give the same name to another one
+WARM_UP_ACCURACY = 1e-6  # of a program that is solved only so that its imports are made
+RENAME_ATTEMPTS = 5  # attempts to rename a directory while another process may give the same name to another one
 
 
 _imported_solvers = set[tuple[str, str]]()  # in this process
@@ -149,13 +149,13 @@ def _import_packages(loaded: Loaded) -> None:
     unit, empty = csc_array(np.ones((1, 1))), csc_array((0, 1))
     smallest = QuadraticProgram(unit, -np.ones(1), unit, np.ones(1), empty, np.zeros(0), np.zeros(1), np.ones(1))
     with suppress(SparseRobError):  # the run itself reports the error
-        build(loaded, "solver", entry).solve(smallest, ACCURACY)
+        build(loaded, "solver", entry).solve(smallest, WARM_UP_ACCURACY)
 
 
 def keep(partial: Path, ends: Path) -> None:
     """Give a complete run directory its final name; a directory with that name, of a run that ended early, is
     removed."""
-    for attempt in range(TRIES):
+    for attempt in range(RENAME_ATTEMPTS):
         retired = partial.with_name(f"{partial.name}.old{attempt}")
         try:
             ends.rename(retired)
@@ -166,7 +166,7 @@ def keep(partial: Path, ends: Path) -> None:
             partial.rename(ends)
             return
         except OSError:
-            if attempt == TRIES - 1 or not ends.exists():
+            if attempt == RENAME_ATTEMPTS - 1 or not ends.exists():
                 raise
 
 

@@ -23,8 +23,8 @@ from sparserob_core.experiment.sweep.table import Row, read_table, shared_unit
 
 RUNS = "runs"
 COLUMNS = ("status", "cost", "relative gap", "active", "seconds")  # columns on a terminal, after those of the axes
-LINES = 50  # largest number of rows of a table on a terminal
-NAMED = 5  # largest number of failures that are reported one by one
+MAX_TABLE_ROWS = 50  # largest number of rows of a table on a terminal
+MAX_NAMED_FAILURES = 5  # largest number of failures that are reported one by one
 
 
 @final
@@ -102,7 +102,7 @@ def shown(study: Study) -> tuple[list[str], list[list[str]]]:
     """Return the table for a terminal: names of the columns, and one row per point, or one per status where there are
     many."""
     unit = f" [{study.cost_unit}]" if study.cost_unit else ""
-    if len(study.table) > LINES:
+    if len(study.table) > MAX_TABLE_ROWS:
         return _summarise_by_status(study.table, unit)
     keys = [axis.key for axis in study.axes]
     columns = [name + unit if name == "cost" else name for name in COLUMNS]
@@ -125,11 +125,11 @@ def remarks_of(study: Study) -> Iterator[str]:
     counts = ", ".join(f"{count} {status}" for status, count in sorted(study.counts.items()))
     yield f"{len(study.table)} of {study.points} points: {counts or 'none yet'}"
     failed = [row for row in study.table if row["status"] == "failed"]
-    for row in failed[:NAMED]:
+    for row in failed[:MAX_NAMED_FAILURES]:
         values = ", ".join(f"{axis.key}={value_text(row[axis.key])}" for axis in study.axes)
         yield f"failed: {f'{values}: ' if values else ''}{row.get('message')}"
-    if len(failed) > NAMED:
-        yield f"and {len(failed) - NAMED} more that failed; the column message says why"
+    if len(failed) > MAX_NAMED_FAILURES:
+        yield f"and {len(failed) - MAX_NAMED_FAILURES} more that failed; the column message says why"
     cut = sum(bool(row.get("stopped")) for row in study.table)
     if cut:
         yield f"{cut} ended at a time limit; they run again when the study is resumed"

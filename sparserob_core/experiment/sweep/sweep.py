@@ -43,12 +43,12 @@ from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.method import ExecutorFactory
 
 PAUSE = 0.5  # seconds between two reports of the points that run
-RENEWED = 2.0  # seconds between two versions of the table
+SECONDS_PER_TABLE = 2.0  # seconds between two versions of the table
 STILLBORN = 3  # number of consecutive executors whose workers may die before they begin a point
-LETTERS = 60  # letters of the name of a run directory, before its hash
-DIGITS = 12  # digits of the hash in that name
+MAX_RUN_NAME_LETTERS = 60  # letters of the name of a run directory, before its hash
+HASH_DIGITS = 12  # digits of the hash in that name
 PARTIAL = ".partial"
-PARTIAL_OWNER = re.compile(rf"-[0-9a-f]{{{DIGITS}}}\.(.*)\.(\d+){re.escape(PARTIAL)}")
+PARTIAL_OWNER = re.compile(rf"-[0-9a-f]{{{HASH_DIGITS}}}\.(.*)\.(\d+){re.escape(PARTIAL)}")
 """End of the name of a run that is not over: the host and the process that began it."""
 
 
@@ -414,7 +414,7 @@ class _SweepCall:
         """Read the answers of these points from the directory."""
         names_by_digest = {name.rpartition("-")[2]: name for name in _list_directories(self.directory / RUNS)}
         for digest in digests:
-            name = names_by_digest.get(digest[:DIGITS])
+            name = names_by_digest.get(digest[:HASH_DIGITS])
             summary = None if name is None else _read_result(self.directory / RUNS / name, digest)
             if name is not None and summary is not None:
                 self.names[digest], self.answers[digest] = name, PointAnswer(summary)
@@ -536,7 +536,7 @@ class _SweepCall:
         self.made.write_text(TABLE, table_text(keys, rows))
         self.made.write_text(COLUMNS, columns_text(keys, rows))
         # a long table is written less often
-        self.due = time.monotonic() + RENEWED + 10.0 * (time.monotonic() - start_time)
+        self.due = time.monotonic() + SECONDS_PER_TABLE + 10.0 * (time.monotonic() - start_time)
 
     def _remove_partial_runs(self) -> None:
         """Remove the partial run directories of dead processes, and of this one."""
@@ -580,7 +580,7 @@ def run_name(axes: Sequence[Axis], point: Point) -> str:
         steps = [str(step) for step in axis.path if step != "name"]
         settings.append(f"{steps[-1] if steps else axis.key}={value_text(value)}")
     text = re.sub(r"[^A-Za-z0-9=.,+_-]+", "-", re.sub(r"[][(){}]|(?<=,)\s", "", "_".join(settings)))
-    return f"{text[:LETTERS].strip('-.,') or 'point'}-{point.hash[:DIGITS]}"
+    return f"{text[:MAX_RUN_NAME_LETTERS].strip('-.,') or 'point'}-{point.hash[:HASH_DIGITS]}"
 
 
 @contextmanager

@@ -17,17 +17,19 @@ import numpy as np
 from sparserob_core.shapes import Array
 from sparserob_core.sip.expressions.forms import Numbers, Operand, take_columns
 from sparserob_core.sip.expressions.rounding import EPSILON, rounding
-from sparserob_core.sip.expressions.taylor import OUTWARD, TaylorSpace
+from sparserob_core.sip.expressions.taylor import OUTWARD_FACTOR, TaylorSpace
 
 Series: TypeAlias = "tuple[list[Array], Array]"
 """Coefficients ``f_0, ..., f_n`` at the constants of models, and bounds of ``|f_{n+1}|`` on their values."""
 MAX_POWER = 64  # the largest exponent for which a power is multiplied out; ten times more take as many products
 MAX_EXPONENT = 700.0  # of the exponential: beyond it doubles overflow
-NEGATIVE = 1e-12  # of values near 1: what rounding may leave below 0; ten times less loses differences of such values
+# Of values near 1: what rounding may leave below 0; ten times less loses differences of such values
+ROUNDING_BELOW_ZERO = 1e-12
 TANGENT_RADII = np.pi / 4 * (1.0 + 0.05 * np.arange(19))  # circles for Cauchy's bound, below the pole at pi/2
-ROUNDED = 1e-13  # of a Bernstein form: rounding of sums of some hundred products and of halvings, which it exceeds
-HALVINGS = 24  # of a cell for its polynomial: with half of them a peak is cut into cells that are expanded anew
-MAX_BOXES = 20_000  # of all polynomials: ten times as many take as long as to expand cells anew
+# Of a Bernstein form: rounding of sums of some hundred products and of halvings, which it exceeds
+BERNSTEIN_ROUNDING = 1e-13
+CELL_HALVINGS = 24  # of a cell for its polynomial: with half of them a peak is cut into cells that are expanded anew
+MAX_POLYNOMIAL_BOXES = 20_000  # of all polynomials: ten times as many take as long as to expand cells anew
 
 
 @final
@@ -55,7 +57,7 @@ class CellModels(Operand):
     def of_fraction(space: TaylorSpace, value: Fraction) -> CellModels:
         """Return one exact number as a model, whose remainder is the distance from its double."""
         model = CellModels.constant(space, np.full((1, 1), float(value)))
-        model.remainder += float(abs(Fraction(float(value)) - value)) * OUTWARD
+        model.remainder += float(abs(Fraction(float(value)) - value)) * OUTWARD_FACTOR
         return model
 
     @staticmethod
@@ -101,13 +103,13 @@ class CellModels(Operand):
         select = np.zeros((count, groups.size))
         select[groups, np.arange(groups.size)] = 1.0
         error = self.remainder + rounding(groups.size) * np.abs(self.coefficients).sum(axis=2)
-        return CellModels(self.space, select @ self.coefficients, error @ select.T * OUTWARD)
+        return CellModels(self.space, select @ self.coefficients, error @ select.T * OUTWARD_FACTOR)
 
     def bounds(self) -> tuple[Array, Array]:
         """Return lower and upper bounds ``(k, K)`` of the values: even monomials are in ``[0, 1]``, others in
         ``[-1, 1]``."""
         nonconstant, even = self.coefficients[..., 1:], self.space.even[1:]
-        radius = (np.abs(nonconstant[..., ~even]).sum(axis=2) + self.remainder) * OUTWARD
+        radius = (np.abs(nonconstant[..., ~even]).sum(axis=2) + self.remainder) * OUTWARD_FACTOR
         middle, slack = self.coefficients[..., 0], EPSILON * np.abs(self.coefficients).sum(axis=2) * self.space.size
         low = middle + np.minimum(nonconstant[..., even], 0.0).sum(axis=2) - radius - slack
         high = middle + np.maximum(nonconstant[..., even], 0.0).sum(axis=2) + radius + slack
@@ -128,7 +130,7 @@ class CellModels(Operand):
         error = bound * reach ** len(terms)
         for k, term in enumerate(terms):  # the coefficients of the series are rounded too, by a few units each
             error = error + rounding(4 * k + 4) * np.abs(term) * reach**k
-        remainder = (result.remainder + error) * OUTWARD
+        remainder = (result.remainder + error) * OUTWARD_FACTOR
         return CellModels(self.space, result.coefficients, np.where(np.isfinite(remainder), remainder, np.inf))
 
     def _sum_powers(self, terms: Sequence[Array], reach: Array) -> CellModels:
@@ -145,7 +147,7 @@ class CellModels(Operand):
         for k, term in enumerate(terms):
             coefficients[..., self.space.index[tuple((k * power).tolist())]] = term * slope**k
             error += np.abs(term) * (k * reach ** max(k - 1, 0) * self.remainder + rounding(k + 4) * reach**k)
-        return CellModels(self.space, coefficients, error * OUTWARD)
+        return CellModels(self.space, coefficients, error * OUTWARD_FACTOR)
 
 
 def _repeat_rows(array: Array, rows: int) -> Array:
@@ -171,7 +173,7 @@ def _add(left: Any, right: Any) -> CellModels:
         number = np.atleast_2d(np.asarray(operand, dtype=float))
         coefficients = model.coefficients + model._constant(number).coefficients
         error = model.remainder + np.zeros(number.shape)
-    return CellModels(model.space, coefficients, (error + EPSILON * np.abs(coefficients).sum(axis=2)) * OUTWARD)
+    return CellModels(model.space, coefficients, (error + EPSILON * np.abs(coefficients).sum(axis=2)) * OUTWARD_FACTOR)
 
 
 def _multiply(left: Any, right: Any) -> CellModels:
@@ -184,7 +186,9 @@ def _multiply(left: Any, right: Any) -> CellModels:
         coefficients = model.coefficients * number[..., None]
         with np.errstate(invalid="ignore"):
             error = np.where(number == 0.0, 0.0, model.remainder * np.abs(number))
-        return CellModels(model.space, coefficients, (error + EPSILON * np.abs(coefficients).sum(axis=2)) * OUTWARD)
+        return CellModels(
+            model.space, coefficients, (error + EPSILON * np.abs(coefficients).sum(axis=2)) * OUTWARD_FACTOR
+        )
     space = model.space
     first, second, begins, rounded = _sorted_products(space)
     a, b = model.coefficients, operand.coefficients
@@ -196,7 +200,7 @@ def _multiply(left: Any, right: Any) -> CellModels:
     with np.errstate(invalid="ignore"):
         error = error + total * operand.remainder + model.remainder * (operand_total + operand.remainder)
     error = np.where(np.isnan(error), np.inf, error)
-    return CellModels(space, coefficients, error * OUTWARD)
+    return CellModels(space, coefficients, error * OUTWARD_FACTOR)
 
 
 def _bound_overflow(space: TaylorSpace, a: Array, b: Array) -> Array:
@@ -218,7 +222,9 @@ def _divide(left: Any, right: Any) -> CellModels:
     if not isinstance(right, CellModels):
         number = np.atleast_2d(np.asarray(right, dtype=float))
         coefficients, error = left.coefficients / number[..., None], left.remainder / np.abs(number)
-        return CellModels(left.space, coefficients, (error + EPSILON * np.abs(coefficients).sum(axis=2)) * OUTWARD)
+        return CellModels(
+            left.space, coefficients, (error + EPSILON * np.abs(coefficients).sum(axis=2)) * OUTWARD_FACTOR
+        )
     return _multiply(right.compose(_reciprocal), left)
 
 
@@ -284,7 +290,7 @@ def _raise_to_fraction(model: CellModels, power: float) -> CellModels:
     """Return a power that is no whole number. Where values reach down to 0, a positive power lies between 0 and its
     chord to the largest value, or beyond it: it differs from the chord by at most its largest distance, to one side.
 
-    Values below 0 by rounding, `NEGATIVE`, count as 0.
+    Values below 0 by rounding, `ROUNDING_BELOW_ZERO`, count as 0.
     """
     result = model.compose(lambda *domain: _power(power, *domain))
     high = model.bounds()[1]
@@ -294,13 +300,13 @@ def _raise_to_fraction(model: CellModels, power: float) -> CellModels:
     coefficients, remainder, top = model.coefficients[touches], model.remainder[touches], high[touches]
     below = np.maximum(bound_polynomials(model.space, -coefficients, remainder, 0.0)[0], 0.0)
     slope, share = top ** (power - 1.0), power ** (1.0 / (1.0 - power))  # where the power is furthest from its chord
-    half = abs(share**power - share) / 2 * top**power * OUTWARD
+    half = abs(share**power - share) / 2 * top**power * OUTWARD_FACTOR
     chord = slope[:, None] * coefficients
     chord[:, 0] += half if power < 1.0 else -half
     error = slope * (remainder + below) + half + rounding(16) * (np.abs(chord).sum(axis=1) + top**power)
-    is_known = below <= np.maximum(NEGATIVE, NEGATIVE * top)
+    is_known = below <= np.maximum(ROUNDING_BELOW_ZERO, ROUNDING_BELOW_ZERO * top)
     result.coefficients[touches] = np.where(is_known[:, None], chord, 0.0)
-    result.remainder[touches] = np.where(is_known & np.isfinite(error), error * OUTWARD, np.inf)
+    result.remainder[touches] = np.where(is_known & np.isfinite(error), error * OUTWARD_FACTOR, np.inf)
     return result
 
 
@@ -323,7 +329,9 @@ def _absolute(model: CellModels) -> CellModels:
     coefficients = sign[..., None] * model.coefficients
     coefficients[crosses] = 0.0
     coefficients[..., 0][crosses] = half[crosses]
-    return CellModels(model.space, coefficients, np.where(crosses, half, model.remainder + 2.0 * excess) * OUTWARD)
+    return CellModels(
+        model.space, coefficients, np.where(crosses, half, model.remainder + 2.0 * excess) * OUTWARD_FACTOR
+    )
 
 
 CellModels.operations = {
@@ -376,16 +384,16 @@ def bound_polynomials(space: TaylorSpace, coefficients: Array, errors: Array, li
         for axis in range(1, nu + 1):
             forms = np.moveaxis(np.tensordot(forms, matrix, axes=(axis, 1)), -1, axis)
             sizes = np.moveaxis(np.tensordot(sizes, np.abs(matrix), axes=(axis, 1)), -1, axis)
-        slack = errors + ROUNDED * sizes.reshape(count, -1).max(axis=1)
+        slack = errors + BERNSTEIN_ROUNDING * sizes.reshape(count, -1).max(axis=1)
         is_finite = np.isfinite(forms).reshape(count, -1).all(axis=1) & np.isfinite(slack)
     bounds, owner, forms = np.where(is_finite, -np.inf, np.inf), np.flatnonzero(is_finite), forms[is_finite]
-    for step in range(HALVINGS + 1 if owner.size else 0):
+    for step in range(CELL_HALVINGS + 1 if owner.size else 0):
         upper = forms.reshape(owner.size, -1).max(axis=1) + slack[owner]
         corners = forms
         for axis in range(1, nu + 1):
             corners = np.take(corners, [0, -1], axis=axis)
         is_attained = corners.reshape(owner.size, -1).max(axis=1) + slack[owner] > limit
-        is_last = step == HALVINGS or owner.size > MAX_BOXES
+        is_last = step == CELL_HALVINGS or owner.size > MAX_POLYNOMIAL_BOXES
         given_up = np.unique(owner[is_attained | (upper > limit) & is_last])
         is_closed = (upper <= limit) | np.isin(owner, given_up)
         np.maximum.at(bounds, owner[is_closed], upper[is_closed])

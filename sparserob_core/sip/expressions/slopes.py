@@ -14,10 +14,13 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import Array
 from sparserob_core.sip.expressions.rounding import rounding
 
-SAMPLES = 64  # indices at which a stated bound is compared with the rows; a tenth misses what turns a few times
-SLACK = 1e-6  # of a bound: differences of rows round, so that a bound that is met exactly may seem exceeded
-STEP = 1e-4  # of a side: distance of the indices that are compared; with a tenth of it rounding grows a hundredfold
-OUTWARD = 1.0 + 1e-9
+# Indices at which a stated bound is compared with the rows; a tenth misses what turns a few times
+COMPARED_INDICES = 64
+# Of a bound: differences of rows round, so that a bound that is met exactly may seem exceeded
+MET_BOUND_ALLOWANCE = 1e-6
+# Of a side: distance of the indices that are compared; with a tenth of it rounding grows a hundredfold
+COMPARED_DISTANCE = 1e-4
+SLOPE_OUTWARD_FACTOR = 1.0 + 1e-9  # for sums of a few bounds that are not negative
 MAX_COORDINATES = 8  # of an index with a bound of curvatures: a cell has 256 corners then
 
 Rows = Callable[[Array], tuple[Array, Array]]
@@ -85,7 +88,7 @@ class BoundedSlopes:
             moves = np.any(widths > 0.0, axis=0).tolist()
             corners = product(*([0.0, 1.0] if axis_moves else [0.0] for axis_moves in moves))
             values = np.max([self._evaluate(x, lower + np.array(corner) * widths) for corner in corners], axis=0)
-        bounds = values + parts.sum(axis=1) * OUTWARD
+        bounds = values + parts.sum(axis=1) * SLOPE_OUTWARD_FACTOR
         return bounds, np.where(parts.any(axis=1, keepdims=True), parts, widths).argmax(axis=1)
 
     def _evaluate(self, x: Array, indices: Array) -> Array:
@@ -98,16 +101,16 @@ class BoundedSlopes:
         """Raise `InputError` where differences of the rows at samples exceed the bound."""
         sides, rng = self.upper - self.lower, np.random.default_rng(0)
         for axis in np.flatnonzero(sides > 0.0).tolist():
-            step = STEP * sides[axis]
+            step = COMPARED_DISTANCE * sides[axis]
             room = sides.copy()
             room[axis] -= 2.0 * step
-            first = self.lower + rng.random((SAMPLES, self.lower.size)) * room
+            first = self.lower + rng.random((COMPARED_INDICES, self.lower.size)) * room
             points = [first + k * step * np.eye(self.lower.size)[axis] for k in range(3)]
             tables = [np.concatenate([G, h[..., None]], axis=2) for G, h in map(self.rows, points)]
             change = tables[1] - tables[0] if self.order == 1 else tables[2] - 2.0 * tables[1] + tables[0]
             size = max(float(np.abs(table).max(initial=0.0)) for table in tables)
             largest = (float(np.abs(change).max(initial=0.0)) - 8.0 * np.finfo(float).eps * size) / step**self.order
-            if largest > self.bounds[axis] * (1.0 + SLACK):
+            if largest > self.bounds[axis] * (1.0 + MET_BOUND_ALLOWANCE):
                 at = first[int(np.abs(change).max(axis=(1, 2)).argmax())].tolist()
                 what = "slope" if self.order == 1 else "curvature"
                 expected = f"a bound of every {what} in coordinate {axis + 1} of the index"

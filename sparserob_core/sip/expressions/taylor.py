@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
 _NUMBERS = (float, int, np.floating, np.integer)
 _MAX_POWER = 64
-HALF = EPSILON / 2  # unit roundoff: bound of the error of an operation, as a share of its result
-OUTWARD = 1.0 + 1e-10  # for bounds that are sums of at most some hundred thousand numbers that are not negative
+UNIT_ROUNDOFF = EPSILON / 2  # unit roundoff: bound of the error of an operation, as a share of its result
+OUTWARD_FACTOR = 1.0 + 1e-10  # for bounds that are sums of at most some hundred thousand numbers that are not negative
 
 
 @final
@@ -108,7 +108,7 @@ class TaylorSpace:
         self._codes = codes[self._order]
         target = self._order[np.searchsorted(self._codes, codes[left] + codes[right])]
         self.products = (left, right, target)
-        shares = HALF * np.bincount(target)[target]
+        shares = UNIT_ROUNDOFF * np.bincount(target)[target]
         self.rounded: Array = shares / (1.0 - shares)  # n u / (1 - n u) for the n summands of a coefficient
         self.faces: dict[bytes, Face] = {}
 
@@ -264,7 +264,7 @@ class TaylorModel:
         cross = self._sum_magnitudes() * other.remainder + self.remainder * (other._sum_magnitudes() + other.remainder)
         if a[1:].any() or b[1:].any():
             cross += float(self.space.rounded @ np.abs(products))
-        return TaylorModel(self.space, coefficients, (self.space.overflow(a, b) + cross) * OUTWARD)
+        return TaylorModel(self.space, coefficients, (self.space.overflow(a, b) + cross) * OUTWARD_FACTOR)
 
     def _raise_to_power(self, count: int) -> TaylorModel:
         result, base = self.space.constant(1.0), self
@@ -298,7 +298,7 @@ class TaylorModel:
             remainder += sum(
                 rounding(4 * k) * abs(coefficient) * reach**k for k, coefficient in enumerate(coefficients)
             )
-        return TaylorModel(self.space, result.coefficients, (result.remainder + remainder) * OUTWARD)
+        return TaylorModel(self.space, result.coefficients, (result.remainder + remainder) * OUTWARD_FACTOR)
 
     def _describe_domain(self) -> tuple[int, float, float, float]:
         return self.space.degree, float(self.coefficients[0]), *self.bounds()
@@ -361,8 +361,8 @@ class TaylorModel:
 def _add_rounding(space: TaylorSpace, coefficients: Array, remainder: float) -> TaylorModel:
     """Return a model with the rounding of its coefficients in the remainder, where each has been rounded once."""
     if coefficients[1:].any():
-        remainder += HALF * float(np.abs(coefficients).sum())
-    return TaylorModel(space, coefficients, remainder * OUTWARD)
+        remainder += UNIT_ROUNDOFF * float(np.abs(coefficients).sum())
+    return TaylorModel(space, coefficients, remainder * OUTWARD_FACTOR)
 
 
 @dataclass(frozen=True, eq=False)

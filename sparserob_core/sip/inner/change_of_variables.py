@@ -17,14 +17,14 @@ from sparserob_core.sip.inner.image import Memory
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
-WORST = 1e6  # condition number above which coordinates are left alone
+MAX_CONDITION = 1e6  # condition number above which coordinates are left alone
 ORDINARY = 1e3  # variables whose bounds are within this factor of 1 are left in their units
 # Units by which a row changes over the bounds of the decision, or ratio of the largest and the least of independent
 # equalities, from which directions become variables; and their number, at most: more are no few that stand out.
 LARGE, DIRECTIONS = 1e3, 8
 UNEVEN, LARGEST = 1e6, 1000  # ratio of curvatures from which they are made even, and entries at most
 ALONE = 0.999  # of a direction: an entry so large is a variable already
-DEPENDENT = 1e-14  # of the largest one: what is left of an equality that depends on others
+DEPENDENT_EQUALITY_SHARE = 1e-14  # of the largest one: what is left of an equality that depends on others
 _inverses = Memory(4)
 _curvatures = Memory(4)
 _units = Memory(4)
@@ -111,7 +111,9 @@ def _divide_rows(program: FiniteProgram) -> NewVariables | None:
     reach = _reach(program)
     L, Q = _orthogonalise(program.A)
     sizes = np.abs(np.diag(L))
-    if not sizes.min(initial=np.inf) > DEPENDENT * sizes.max(initial=0.0):  # some equalities say the same
+    if not sizes.min(initial=np.inf) > DEPENDENT_EQUALITY_SHARE * sizes.max(
+        initial=0.0
+    ):  # some equalities say the same
         return None
     is_uneven = bool(sizes.size) and sizes.max() > LARGE * sizes.min()
     large = int(np.count_nonzero(np.abs(program.G) @ reach > LARGE))
@@ -248,7 +250,7 @@ def _find_axes(P: csc_array) -> tuple[Array, Array] | None:
         return None
     eigenvalues, axes = np.linalg.eigh(P.toarray())
     ratio = eigenvalues[0] / eigenvalues[-1] if eigenvalues[-1] > 0.0 else 0.0
-    return (axes / np.sqrt(eigenvalues), eigenvalues) if DEPENDENT <= ratio <= 1.0 / UNEVEN else None
+    return (axes / np.sqrt(eigenvalues), eigenvalues) if DEPENDENT_EQUALITY_SHARE <= ratio <= 1.0 / UNEVEN else None
 
 
 def _scale_bounds(lower: Array, upper: Array, weights: Array) -> tuple[Array, Array, Array, Array] | None:
@@ -266,7 +268,7 @@ def _invert(S: csc_array) -> Array | None:
         inverse = np.linalg.inv(dense)
     except np.linalg.LinAlgError:
         return None
-    return inverse if np.linalg.norm(dense, 1) * np.linalg.norm(inverse, 1) <= WORST else None
+    return inverse if np.linalg.norm(dense, 1) * np.linalg.norm(inverse, 1) <= MAX_CONDITION else None
 
 
 def _transform_curvature(P: csc_array, inverse: Array) -> csc_array | None:

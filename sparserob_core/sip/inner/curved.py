@@ -22,11 +22,11 @@ from sparserob_core.sip.inner.image import Memory
 # Of the least eigenvalue that is estimated, what is tried to be proven. With all of it rounding decides; a hundredth of
 # it is as good, for what residual slopes cost is mostly far below the tolerated gap.
 PROVEN = 0.5
-ROUNDING = 2.0**-52
+MACHINE_EPSILON = 2.0**-52  # the distance of 1 to the next double
 # Entries up to which a matrix is looked at. Ten times as many take minutes, a tenth leaves fits of a hundred terms out.
-LARGE = 600
+MAX_MATRIX_ENTRIES = 600
 REFINEMENTS = 4  # each gains four digits at a condition of 1e12; a fifth is lost in rounding
-NEAR = 1e-9  # of its bounds' distance: an entry so near to a bound is held there
+HELD_DISTANCE = 1e-9  # of its bounds' distance: an entry so near to a bound is held there
 _curvatures = Memory(4)
 
 
@@ -51,12 +51,12 @@ def least_curvature(P: Array) -> Array | None:
         factor = np.linalg.cholesky(scaled - share * np.eye(n))
     except np.linalg.LinAlgError:
         return None
-    error = 2.0 * (n + 2) * ROUNDING * float(scaled.trace())
+    error = 2.0 * (n + 2) * MACHINE_EPSILON * float(scaled.trace())
     if not share > error:
         error = _bound_factor_error(scaled, share, factor)
     if not share > error:
         return None
-    return np.asarray((share - error) / unit**2 * (1.0 - 4.0 * ROUNDING), dtype=float)
+    return np.asarray((share - error) / unit**2 * (1.0 - 4.0 * MACHINE_EPSILON), dtype=float)
 
 
 def _bound_factor_error(scaled: Array, share: float, factor: np.ndarray) -> float:
@@ -73,11 +73,17 @@ def _bound_factor_error(scaled: Array, share: float, factor: np.ndarray) -> floa
 def curvature_of(program: FiniteProgram) -> Array | None:
     """Return numbers ``c (n,)`` with ``P >= diag(c)`` for the matrix of a quadratic cost, remembered between calls.
 
-    ``None`` without a quadratic cost, for an image, for norms of blocks, beyond `LARGE` entries, and where nothing is
-    proven; also for a diagonal ``P``, which a dual bound minimises entry by entry.
+    ``None`` without a quadratic cost, for an image, for norms of blocks, beyond `MAX_MATRIX_ENTRIES` entries, and where
+    nothing is proven; also for a diagonal ``P``, which a dual bound minimises entry by entry.
     """
     P = program.P
-    if P is None or program.S is not None or program.blocks is not None or program.separable or program.n > LARGE:
+    if (
+        P is None
+        or program.S is not None
+        or program.blocks is not None
+        or program.separable
+        or program.n > MAX_MATRIX_ENTRIES
+    ):
         return None
     return _curvatures.recall((P,), None, lambda: least_curvature(P.toarray()))
 
@@ -116,8 +122,8 @@ def _find_stationary_point(program: FiniteProgram, wide: np.ndarray, pull: np.nd
     """Return the point near ``at`` where the slope of every entry is 0 that no bound and no kink holds."""
     low, high, weights = program.lower, program.upper, program.weights
     width = np.where(np.isfinite(high - low), high - low, 1.0)
-    is_held = (at - low <= NEAR * width) | (high - at <= NEAR * width) | (weights > 0.0) & (at == 0.0)
-    point = np.where(at - low <= NEAR * width, low, np.where(high - at <= NEAR * width, high, at))
+    is_held = (at - low <= HELD_DISTANCE * width) | (high - at <= HELD_DISTANCE * width) | (weights > 0.0) & (at == 0.0)
+    point = np.where(at - low <= HELD_DISTANCE * width, low, np.where(high - at <= HELD_DISTANCE * width, high, at))
     free = np.flatnonzero(~is_held)
     if not free.size:
         return point

@@ -23,15 +23,15 @@ from sparserob_core.sip.inner.change_of_variables import in_new_variables
 from sparserob_core.sip.inner.duality import bent_minimisers, measure
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 
-ITERATIONS = 60
-PATIENCE = 10
-SEARCH = 25
-TARGET = 1e-12
+NEWTON_ITERATIONS = 60  # at most, before the program is left to another solver
+IDLE_STEPS = 10  # without a smaller error, after which the method gives up
+LINE_SEARCH_STEPS = 25  # at most, in either direction: lengths are multiplied by four, so that 25 reach any size
+RESIDUAL_TARGET = 1e-12  # of the decision: a residual at which the method ends, some roundings of a product
 TINY = float(np.finfo(float).tiny)
 DAMPING, DAMPED = 1e-13, 1e4  # of the trace of a Hessian, and what that becomes where a step climbs nothing
 # below this, relative to the linear cost, the curvature amplifies round-off too much for Newton's method alone
-FLAT = 1e-4
-STILL = 1e-9  # a proximal point that moves by less, relative to the decision, has arrived
+MIN_CURVATURE_SHARE = 1e-4
+ARRIVAL_DISTANCE = 1e-9  # a proximal point that moves by less, relative to the decision, has arrived
 HEAVIEST, LIGHTEST = 1e6, 1e-9  # weights of a proximal point, of the largest coefficient of the cost
 LIGHTER, HEAVIER = 0.1, 30.0  # what a weight becomes after a proximal point that was found, and one that was not
 NOT_SEPARABLE = "its quadratic cost couples variables: a separable program is needed"
@@ -103,7 +103,7 @@ def from_nothing(program: FiniteProgram, accuracy: float, points: int) -> tuple[
     y, mu, x = np.zeros(program.h.size), np.zeros(program.b.size), np.clip(0.0, program.lower, program.upper)
     best = measure(program, x, y, mu, message="nothing")
     weight, idle, number = cost, 0, 0
-    while number < points and idle <= PATIENCE and weight <= HEAVIEST * cost:
+    while number < points and idle <= IDLE_STEPS and weight <= HEAVIEST * cost:
         number += 1
         if weight <= least:
             near = newton_solve(program, y, mu)  # it is bent enough itself
@@ -132,7 +132,7 @@ def polish(
     curvature = program.curvature if program.separable else None
     if curvature is None or x.shape != program.q.shape or y.shape != program.h.shape or mu.shape != program.b.shape:
         return None
-    is_curved = float(curvature.min(initial=np.inf)) >= FLAT * program.steepest
+    is_curved = float(curvature.min(initial=np.inf)) >= MIN_CURVATURE_SHARE * program.steepest
     solution = newton_solve(program, y, mu, x0=x) if is_curved else None
     return proximal_polish(program, x, y, mu) if solution is None else solution
 
@@ -168,7 +168,7 @@ def proximal_polish(
             break
         if (
             not is_flat
-            and distance <= STILL * (1.0 + float(np.abs(x).max(initial=0.0)))
+            and distance <= ARRIVAL_DISTANCE * (1.0 + float(np.abs(x).max(initial=0.0)))
             and weight <= 2 * curvature.min()
         ):
             break
@@ -252,8 +252,8 @@ def newton_solve(
     program: FiniteProgram,
     y0: Float[Array, " r"],
     mu0: Float[Array, " e"] | None = None,
-    steps: int = ITERATIONS,
-    patience: int = PATIENCE,
+    steps: int = NEWTON_ITERATIONS,
+    patience: int = IDLE_STEPS,
     x0: Float[Array, " n"] | None = None,
 ) -> FiniteSolution | None:
     """Return the optimum of a program with identity image and a positive diagonal ``P``, from dual variables
@@ -312,7 +312,7 @@ def _ascend(dual: _Dual, point: _Point, steps: int, patience: int) -> _Point | N
     error = least = dual.error(point)
     stalled, damping = 0, DAMPING
     for _ in range(steps):
-        if error <= TARGET * scale:
+        if error <= RESIDUAL_TARGET * scale:
             return point
         if not np.isfinite(error) or stalled > patience:
             return None
@@ -377,7 +377,7 @@ def _search_line(dual: _Dual, point: _Point, step: Float[Array, " v"]) -> float:
     falling = dual.signed & (step < 0)
     furthest = max(1.0, float((point.dual[falling] / -step[falling]).min(initial=np.inf)))
     low, rising, high = 0.0, first, 1.0
-    for _ in range(SEARCH):
+    for _ in range(LINE_SEARCH_STEPS):
         derivative = float(change @ dual.decision(slope + high * change)) - constant
         if derivative <= 0.1 * first:
             break
@@ -387,7 +387,7 @@ def _search_line(dual: _Dual, point: _Point, step: Float[Array, " v"]) -> float:
     if derivative > 0:
         return high
     length, sinking = high, derivative
-    for _ in range(SEARCH):
+    for _ in range(LINE_SEARCH_STEPS):
         if abs(derivative) <= 0.1 * first:
             return length
         if derivative > 0:

@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 # tenth of it, slopes of 0 are refused for what a projection leaves; ten times as much costs digits of bounds.
 ROUND_OFF = 1e-14
 EPSILON = float(np.finfo(float).eps)
-SPARE = 16  # roundings beside those of long sums: of products with a weight, of what is added last
+SPARE_ROUNDINGS = 16  # roundings beside those of long sums: of products with a weight, of what is added last
 
-NOTABLE = 1e-11  # of a bound: where its evaluation may be off by more, it is evaluated with more digits
-NEAR = 1e-6  # a slope this close to its limit, or beyond it, is moved onto the limit
-LEAST = 1e300  # an infinite bound of one block is compared as minus this number
-REPAIRS = 4
+MORE_DIGITS_ERROR = 1e-11  # of a bound: where its evaluation may be off by more, it is evaluated with more digits
+SLOPE_LIMIT_DISTANCE = 1e-6  # a slope this close to its limit, or beyond it, is moved onto the limit
+INFINITE_BOUND = 1e300  # an infinite bound of one block is compared as minus this number
+MAX_REPAIRS = 4  # corrections of multipliers of the wrong sign; what is not right by then is no better bound
 FREE = 1e-7  # an entry further than this from 0 and from both bounds, relative to their distance, is free
-TIGHT = 1e-9  # a row with a slack below this may carry a multiplier
+ACTIVE_ROW_SLACK = 1e-9  # a row with a slack below this may carry a multiplier
 ACTIVE = 1e-9  # a row with a multiplier above this, relative to the largest, is active
 
 Multipliers: TypeAlias = tuple[Array, Array, Array | None, Array | None]
@@ -97,7 +97,7 @@ def _prove_bound(
 ) -> tuple[float, Array, Array, Array | None]:
     bound = _evaluate_bound(terms, program)
     if bound > -np.inf:
-        large = terms.round_off * terms.magnitude > NOTABLE * abs(bound)
+        large = terms.round_off * terms.magnitude > MORE_DIGITS_ERROR * abs(bound)
         bound = max(bound, extended_bound(program, y, mu)) if large else bound
         is_beyond = _find_overshoot(terms, program, bound)
         if is_beyond is not None:
@@ -276,7 +276,7 @@ def bound_rounding(count: int) -> float:
     A chain of ``n`` roundings errs by at most ``n u / (1 - n u)`` (Higham 2002, section 3.1). Twice ``n u`` is allowed,
     which pays for the rounding of the absolute values too.
     """
-    return max(ROUND_OFF, (count + SPARE) * EPSILON)
+    return max(ROUND_OFF, (count + SPARE_ROUNDINGS) * EPSILON)
 
 
 def _count_terms(program: FiniteProgram, y: Array) -> int:
@@ -321,7 +321,7 @@ def without_norms(terms: Terms, program: FiniteProgram) -> Terms:
         slope = (terms.slope + offer)[entries]
         with np.errstate(invalid="ignore"):
             least = np.where(slope > 0.0, slope * low, np.where(slope < 0.0, slope * high, 0.0))
-        bounds.append(np.bincount(of, np.maximum(least, -LEAST), blocks.first.size))
+        bounds.append(np.bincount(of, np.maximum(least, -INFINITE_BOUND), blocks.first.size))
         slopes.append(slope)
     best = np.argmax(bounds, axis=0)[of]
     slope, weights, noise = terms.slope.copy(), terms.weights.copy(), terms.noise.copy()
@@ -351,18 +351,18 @@ def _evaluate_bound(terms: Terms, program: FiniteProgram) -> float:
 
 
 def _find_overshoot(terms: Terms, program: FiniteProgram, bound: float) -> Bool[np.ndarray, " k"] | None:
-    """Return a mask of the entries whose slope is beyond their weight by a little, `NEAR` of it, where that costs a
-    notable share of the bound because their bounds are far away. ``None`` where there is none, or where shrinking the
-    multipliers is no way out (`_shrink_multipliers`)."""
+    """Return a mask of the entries whose slope is beyond their weight by a little, `SLOPE_LIMIT_DISTANCE` of it, where
+    that costs a notable share of the bound because their bounds are far away. ``None`` where there is none, or where
+    shrinking the multipliers is no way out (`_shrink_multipliers`)."""
     if program.q.any() or program.P is not None or program.blocks is not None or not isfinite(bound):
         return None
     excess = np.abs(terms.slope) - terms.weights
     if not excess.max(initial=0.0) > 0.0:
         return None
-    near = (excess > 0.0) & (excess <= NEAR * terms.weights)
+    near = (excess > 0.0) & (excess <= SLOPE_LIMIT_DISTANCE * terms.weights)
     reach = np.where(terms.slope > 0.0, -program.lower, program.upper)[near]
     loss = float(excess[near] @ np.maximum(reach, 0.0)) if near.any() else 0.0
-    return near if loss > NOTABLE * abs(bound) else None
+    return near if loss > MORE_DIGITS_ERROR * abs(bound) else None
 
 
 @shaped
@@ -400,7 +400,7 @@ def repaired(
     Only positive ``y``, ``mu``, the point ``at`` of the tangent to ``P``, and the ``z`` of bounded images are moved.
     """
     better: Multipliers | None = (y, mu, z, at)
-    for _ in range(REPAIRS):
+    for _ in range(MAX_REPAIRS):
         if better is None or not all(np.isfinite(v).all() for v in better if v is not None):
             return None
         better = _correct_multipliers(program, *better)
@@ -447,7 +447,7 @@ def _correct_multipliers(
 @shaped
 def _is_at_limit(program: FiniteProgram, z: Float[Array, " k"]) -> Bool[np.ndarray, " k"]:
     """Return unbounded images whose multiplier is at its limit, the weight, or beyond."""
-    near = np.abs(z) > program.weights - NEAR * (1.0 + program.weights)
+    near = np.abs(z) > program.weights - SLOPE_LIMIT_DISTANCE * (1.0 + program.weights)
     return near & (np.isposinf(program.upper) & (z >= 0) | np.isneginf(program.lower) & (z <= 0))
 
 
@@ -511,7 +511,7 @@ def vertex_multipliers(
     2). Any answer is safe: weak duality decides what it is worth. ``S`` must be the identity and ``P`` absent,
     otherwise the multipliers come back unchanged.
     """
-    tight = program.h - program.G @ x <= TIGHT * np.maximum(1.0, np.abs(program.h))
+    tight = program.h - program.G @ x <= ACTIVE_ROW_SLACK * np.maximum(1.0, np.abs(program.h))
     active = np.flatnonzero((y > ACTIVE * y.max(initial=0.0)) | tight)
     if program.S is not None or program.P is not None or not active.size + mu.size:
         return y, mu

@@ -13,7 +13,8 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram
 
 WIDE = np.longdouble
-NEAR = 1e-9
+# Of a slope: one that is so near its weight decides nothing, so that either side of its entry is evaluated.
+SLOPE_ALLOWANCE = 1e-9
 UNIT = float(np.finfo(WIDE).eps)  # at least twice the unit roundoff, whatever the machine calls extended
 
 
@@ -47,7 +48,7 @@ def extended_bound(program: FiniteProgram, y: Float[Array, " r"], mu: Float[Arra
     size = np.abs(v) @ np.abs(rhs) + np.abs(least).sum() + abs(program.constant)
     # the terms of each minimum are rounded too, and no larger than at the bound further away; where the slope is well
     # within the weight, the minimum is 0 without rounding
-    near = (least != 0.0) | ((1.0 + NEAR) * np.abs(slope) + error >= program.weights)
+    near = (least != 0.0) | ((1.0 + SLOPE_ALLOWANCE) * np.abs(slope) + error >= program.weights)
     moving = np.where(near, (program.weights + terms + curvature * reach) * reach, 0.0)
     size = size + 8.0 * moving.sum() / (program.n + v.size + 8)
     total = least.sum() - v @ rhs + program.constant - _bound_rounding(program.n + v.size + 8) * size

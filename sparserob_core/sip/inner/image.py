@@ -41,11 +41,11 @@ class Memory:
         return result
 
 
-HOLDS = 5
-CANCELLED = 1e-13  # of what is added up: what may be left where more cannot be had
+MAX_PROJECTIONS = 5  # of the multipliers of an image, at most
+CANCELLED_SHARE = 1e-13  # of what is added up: what may be left where more cannot be had
 # Of the same: what is left by rounding alone, and not worth a projection. With ten times as much a bound is above what
 # its multipliers prove by more than what is taken off it; with a tenth of it every exact answer is projected.
-ROUNDED = 4 * 2.0**-52
+STATIONARY_ROUNDING = 4 * 2.0**-52
 _factors = Memory(12)
 
 
@@ -63,13 +63,13 @@ def onto_stationary(program: FiniteProgram, z: Float[Array, " k"], slope: Float[
     unbounded_above, unbounded_below = np.isposinf(program.upper), np.isneginf(program.lower)
     is_held = (program.weights == 0) & unbounded_below & unbounded_above
     projected = z
-    for number in range(HOLDS):
-        if number or not _is_stationary(S, projected, slope, ROUNDED):
+    for number in range(MAX_PROJECTIONS):
+        if number or not _is_stationary(S, projected, slope, STATIONARY_ROUNDING):
             z = np.where(is_held, np.clip(z, -program.weights, program.weights), z)
             project = _factors.recall((S,), is_held.tobytes(), partial(_factor_projection, S, ~is_held))
             projected = z - project(S.T @ z + slope)
             projected = projected - project(S.T @ projected + slope)
-        limit = program.weights + CANCELLED * float(np.abs(projected).max(initial=0.0))
+        limit = program.weights + CANCELLED_SHARE * float(np.abs(projected).max(initial=0.0))
         is_beyond = ~is_held & (unbounded_above & (projected > limit) | unbounded_below & (projected < -limit))
         if not is_beyond.any():
             break
@@ -101,7 +101,7 @@ def _find_single_entries(S: csc_array) -> tuple[npt.NDArray[np.int64], npt.NDArr
     return rows, by_row.indices[places].astype(np.int64), np.asarray(by_row.data[places])
 
 
-def _is_stationary(S: csc_array, z: Array, slope: Array, share: float = CANCELLED) -> bool:
+def _is_stationary(S: csc_array, z: Array, slope: Array, share: float = CANCELLED_SHARE) -> bool:
     residual, size = np.abs(S.T @ z + slope), np.abs(S).T @ np.abs(z) + np.abs(slope)
     return bool((residual <= share * size.max(initial=0.0)).all())
 

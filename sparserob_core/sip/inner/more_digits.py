@@ -15,12 +15,12 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 
-STEPS = 4
+REFINEMENT_STEPS = 4  # at most, each with the residual of the last one
 GROWTH = 2.0**20  # by which a step blows up more than the last one, at most
-LARGEST = 2.0**60
-FAR = 2.0**30  # a bound at this distance is none
-DEAR = 2.0**30  # a variable that costs this much stays at its bound
-RANK = 1e-13  # of the largest entry: what is left of a row that depends on others
+LARGEST_SCALE = 2.0**60  # by which a residual is enlarged: a smaller one is rounding
+ABSENT_BOUND = 2.0**30  # a bound at this distance is none
+PROHIBITIVE_COST = 2.0**30  # a variable that costs this much stays at its bound
+DEPENDENT_ROW_SHARE = 1e-13  # of the largest entry: what is left of a row that depends on others
 
 
 def refined(program: QuadraticProgram, solver: Solver, start: Claim | None, accuracy: float) -> Iterator[Claim]:
@@ -47,14 +47,14 @@ def refined(program: QuadraticProgram, solver: Solver, start: Claim | None, accu
         w = np.concatenate([start.x, (program.h - program.G @ start.x) / units])
         y = np.concatenate([np.linalg.solve(combine.T, np.maximum(start.z, 0.0)), start.y])
     p = d = 1.0
-    for number in range(STEPS):
+    for number in range(REFINEMENT_STEPS):
         w = np.clip(w, lower, upper)
         residual, slope = c - M @ w, q + P @ w + M.T @ y
         if number or start is not None:
             p = _choose_factor(p, float(np.abs(residual).max(initial=0.0)))
             d = _choose_factor(d, _measure_dual_residual(slope, p * (w - lower), p * (upper - w)))
         below, above, cost = p * (lower - w), p * (upper - w), d * slope
-        is_held = (cost > DEAR) & (below > -1.0) | (cost < -DEAR) & (above < 1.0)
+        is_held = (cost > PROHIBITIVE_COST) & (below > -1.0) | (cost < -PROHIBITIVE_COST) & (above < 1.0)
         fixed, free = np.where(is_held, np.where(cost > 0.0, below, above), 0.0), np.flatnonzero(~is_held)
         step = QuadraticProgram(
             csc_array(diags_array(np.full(free.size, d / p)) @ P[free][:, free]),
@@ -63,8 +63,8 @@ def refined(program: QuadraticProgram, solver: Solver, start: Claim | None, accu
             np.zeros(0),
             csc_array(M[:, free]),
             p * residual - M @ fixed,
-            np.where(below < -FAR, -np.inf, below)[free],
-            np.where(above > FAR, np.inf, above)[free],
+            np.where(below < -ABSENT_BOUND, -np.inf, below)[free],
+            np.where(above > ABSENT_BOUND, np.inf, above)[free],
         )
         answer = solver.solve(step, accuracy)
         if answer.x.shape != free.shape or answer.y.shape != c.shape:
@@ -89,15 +89,15 @@ def _orthogonalise_rows(G: Array) -> Array:
     kept = min(R.shape[0], count)
     L[:, :kept] = R[:kept].T
     size = np.abs(np.diag(R))
-    rank = int((size > RANK * size.max(initial=0.0)).sum())
+    rank = int((size > DEPENDENT_ROW_SHARE * size.max(initial=0.0)).sum())
     L[:, rank:] = np.eye(count)[:, rank:]
     return np.asarray(solve_triangular(L, np.eye(count)[order], lower=True))
 
 
 def _choose_factor(before: float, residual: float) -> float:
     """Return the power of two that makes what is missed of size 1, at most `GROWTH` times the one before."""
-    wanted = LARGEST if residual < 1.0 / LARGEST else float(np.exp2(np.floor(-np.log2(residual))))
-    return float(min(max(wanted, before), GROWTH * before, LARGEST))
+    wanted = LARGEST_SCALE if residual < 1.0 / LARGEST_SCALE else float(np.exp2(np.floor(-np.log2(residual))))
+    return float(min(max(wanted, before), GROWTH * before, LARGEST_SCALE))
 
 
 def _measure_dual_residual(slope: Array, below: Array, above: Array) -> float:

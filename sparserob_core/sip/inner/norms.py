@@ -14,9 +14,9 @@ from sparserob_core.sip.finite import Blocks, Directions, FiniteProgram
 from sparserob_core.sip.inner.image import onto_stationary
 
 FAN = 8  # directions of a block of two entries, to begin with
-CORNERS = 4  # entries of a block up to which the corners of a cube are looked at too
-KEPT = 6  # directions of a block, those nearest to what an answer asks for, that are worth keeping
-NOTHING = 1e-14  # of the largest norm: a block that has no direction
+MAX_CUBE_ENTRIES = 4  # entries of a block up to which the corners of a cube are looked at too
+BLOCK_DIRECTIONS_KEPT = 6  # directions of a block, those nearest to what an answer asks for, that are worth keeping
+NEGLIGIBLE_NORM = 1e-14  # of the largest norm: a block that has no direction
 
 
 def around(blocks: Blocks) -> Directions:
@@ -36,7 +36,7 @@ def _list_unit_vectors(size: int) -> Array:
         angles = 2.0 * np.pi * np.arange(FAN) / FAN
         return np.column_stack([np.cos(angles), np.sin(angles)])
     axes = np.eye(size)
-    if size > CORNERS or size == 1:
+    if size > MAX_CUBE_ENTRIES or size == 1:
         return np.vstack([axes, -axes])
     corners = np.array(list(product((-1.0, 1.0), repeat=size))) / np.sqrt(size)
     return np.vstack([axes, -axes, corners])
@@ -62,13 +62,14 @@ def towards(
 
 
 def near(directions: Directions, wanted: Directions) -> Directions:
-    """Return, for every block, the at most `KEPT` directions that are nearest to one of its ``wanted`` directions."""
+    """Return, for every block, the at most `BLOCK_DIRECTIONS_KEPT` directions that are nearest to one of its ``wanted``
+    directions."""
     kept = []
     for block in np.unique(wanted.block):
         candidates = np.flatnonzero(directions.block == block)
         targets = wanted.vectors[wanted.block == block]
         cosines = (directions.vectors[candidates] @ targets.T).max(axis=1, initial=-1.0)
-        kept.append(candidates[np.argsort(-cosines, kind="stable")[:KEPT]])
+        kept.append(candidates[np.argsort(-cosines, kind="stable")[:BLOCK_DIRECTIONS_KEPT]])
     chosen = np.concatenate([np.zeros(0, dtype=int), *kept])
     return Directions(directions.block[chosen], directions.vectors[chosen])
 
@@ -119,7 +120,7 @@ def of_the_rest(directions: Directions, moving: Bool[np.ndarray, " b"], width: i
 
 def _find_directions(blocks: Blocks, image: Array) -> Directions:
     norms = blocks.norms(image)
-    kept = np.flatnonzero(norms > NOTHING * norms.max(initial=0.0))
+    kept = np.flatnonzero(norms > NEGLIGIBLE_NORM * norms.max(initial=0.0))
     table = blocks.table[kept]
     vectors = np.where(table >= 0, blocks.directions(image)[table], 0.0)
     return Directions(kept, vectors)

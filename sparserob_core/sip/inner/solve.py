@@ -56,17 +56,17 @@ DIRECTIONS, PATIENCE = 60, 12
 NEARLY, NEWTON, SMALLEST = 0.03, 6, 1e-7
 # Steps of the simplex method for each row and variable, at most, where another method lacks digits: an ordinary program
 # takes one to three. With a third of them some are given up; ten times as many take longer than what they replace.
-TURNS = 10
+SIMPLEX_STEPS_PER_ROW = 10
 # Rows and entries from which Newton's method begins with nothing, where every entry is bent: of 230 rows that a state
 # along a wall is left with, and 2880 entries, it takes 0.4 s and an interior-point method 10.6 s; of dense random ones,
 # nearly all active, half as long with 300 and 3000, as long with 120 and 1000, and with 300 and 400 ten times as long.
 CROWDED, WIDE = 100, 2000
-POINTS = 40  # proximal points then: 37 were needed at most; with four only easy programs are solved
+MAX_PROXIMAL_POINTS = 40  # proximal points then: 37 were needed at most; with four only easy programs are solved
 # Answers in a row that a solver that was named does not call solved, and nobody believes, until another one is asked.
 # With one, programs are left that the second form solves; with ten, a first-order method takes a minute for a run that
 # others end in two seconds.
 LOST = 3
-CRUDE = 1e-6  # largest residual of an answer whose gap says something
+CRUDE_ANSWER_RESIDUAL = 1e-6  # largest residual of an answer whose gap says something
 
 ADVICE = "try another solver, or state the problem in units in which its numbers are of one size"
 
@@ -309,7 +309,7 @@ def _judge_answer(
     for offer in ((y, mu), vertex_multipliers(case.program.tangent(x), x, y, mu)):
         solution = measure(case.program, x, *offer, z, message="claimed")
         believed = case.judge(solution, name, by)
-        gap = min(gap, solution.gap if solution.residual <= CRUDE else np.inf)
+        gap = min(gap, solution.gap if solution.residual <= CRUDE_ANSWER_RESIDUAL else np.inf)
         if believed is not None:
             return believed, gap
     return None, gap
@@ -408,7 +408,7 @@ def _list_corners(case: _Case) -> Iterator[FiniteSolution]:
     program = case.program
     if program.P is not None or program.blocks is not None:
         return
-    corner = simplex(program, TURNS * (program.n + program.h.size + program.b.size))
+    corner = simplex(program, SIMPLEX_STEPS_PER_ROW * (program.n + program.h.size + program.b.size))
     if corner.status == "unbounded":
         case.falls = True
         case.attempts.append("the simplex method: the cost falls without bound")
@@ -501,7 +501,7 @@ def _list_cheap_answers(case: _Case, guess: FiniteSolution | None) -> Iterator[t
             yield DUAL_NEWTON, polished
     large = program.separable and program.h.size >= CROWDED and program.n >= WIDE
     if DUAL_NEWTON in quick and large and program.curvature is not None and program.curvature.min() > 0.0:
-        yield DUAL_NEWTON, from_nothing(program, 0.1 * case.tolerance, POINTS)[0]
+        yield DUAL_NEWTON, from_nothing(program, 0.1 * case.tolerance, MAX_PROXIMAL_POINTS)[0]
 
 
 def _ask_solver(
@@ -563,7 +563,7 @@ def _list_elastic_answers(case: _Case, forms: tuple[Form, ...]) -> Iterator[tupl
     was named, and the solver's in each form until it calls one solved."""
     relaxed = elastic_program(case.program)
     if HIGHS in case.solver.quick:
-        corner = simplex(relaxed, TURNS * (relaxed.n + relaxed.h.size))
+        corner = simplex(relaxed, SIMPLEX_STEPS_PER_ROW * (relaxed.n + relaxed.h.size))
         if corner.status == "optimal":
             yield HIGHS, (corner.x, corner.y, corner.mu, corner.z)
     for form in forms:

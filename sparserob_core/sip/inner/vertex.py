@@ -15,10 +15,10 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram
 
-ACCURACY = 1e-10  # the finest that the simplex method offers
-MANY = 5000  # entries of a separable program from which most are left out of the simplex method
+SIMPLEX_ACCURACY = 1e-10  # the finest that the simplex method offers
+SIFTED_ENTRIES = 5000  # entries of a separable program from which most are left out of the simplex method
 NEAREST = 1000  # of them, those that it begins with; or a share of them
-SHARE = 0.05
+NEAREST_SHARE = 0.05  # of the entries: those that the simplex method begins with, where that is more
 UNSOLVED: dict[int, Literal["infeasible", "unbounded"]] = {2: "infeasible", 3: "unbounded"}  # scipy's numbers
 
 
@@ -47,10 +47,10 @@ def vertex(program: FiniteProgram, y: Array | None = None, mu: Array | None = No
 
 
 def many(program: FiniteProgram) -> bool:
-    """Return whether a linear program is to be solved by `sifted`: separable, with at least `MANY` entries, and with
-    rows."""
+    """Return whether a linear program is to be solved by `sifted`: separable, with at least `SIFTED_ENTRIES` entries,
+    and with rows."""
     return bool(
-        program.n >= MANY
+        program.n >= SIFTED_ENTRIES
         and program.h.size + program.b.size
         and all(term is None for term in (program.P, program.S, program.blocks))
     )
@@ -65,7 +65,7 @@ def sifted(program: FiniteProgram, y: Array | None = None, mu: Array | None = No
     """
     y = np.zeros(program.h.size) if y is None or y.shape != program.h.shape else y
     mu = np.zeros(program.b.size) if mu is None or mu.shape != program.b.shape else mu
-    near, count = np.zeros(program.n, dtype=bool), max(NEAREST, int(SHARE * program.n))
+    near, count = np.zeros(program.n, dtype=bool), max(NEAREST, int(NEAREST_SHARE * program.n))
     near[:: max(1, program.n // count)] = True  # neighbours are alike: some of everything, then zoom in
     x, distance = _evaluate_entries(program, y, mu)
     while True:
@@ -142,7 +142,7 @@ def simplex(program: FiniteProgram, turns: int | None = None) -> Corner:
         b_eq=columns["right"],
         bounds=columns["bounds"],
         method="highs-ds",
-        options={"primal_feasibility_tolerance": ACCURACY, "dual_feasibility_tolerance": ACCURACY}
+        options={"primal_feasibility_tolerance": SIMPLEX_ACCURACY, "dual_feasibility_tolerance": SIMPLEX_ACCURACY}
         | ({} if turns is None else {"maxiter": turns}),
     )
     if answer.status != 0 or answer.x is None:

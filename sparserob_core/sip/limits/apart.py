@@ -19,7 +19,8 @@ from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
 
 Value = TypeVar("Value")
 
-CHUNK = 2**16  # bytes that are read at a time; of a tenth a large answer takes many calls, ten times more are no matter
+# Bytes that are read at a time; of a tenth a large answer takes many calls, ten times more are no matter
+PIPE_CHUNK_BYTES = 2**16
 POSSIBLE = hasattr(os, "fork") and sys.platform != "darwin"  # libraries of Apple do not survive a fork
 
 
@@ -96,7 +97,7 @@ def _read_answer(read: int, deadline: Deadline) -> bytes:
     while True:
         if not select.select([read], [], [], deadline.left)[0]:
             raise OutOfTime(deadline.reason)
-        chunk = os.read(read, CHUNK)
+        chunk = os.read(read, PIPE_CHUNK_BYTES)
         if not chunk:
             return answer
         answer += chunk

@@ -17,10 +17,10 @@ import numpy as np
 
 from sparserob_core.errors import InputError, SparseRobError
 
-GRACE = 0.25
+LIMIT_GRACE_SECONDS = 0.25
 """Seconds after a limit in which a method may end by itself. Ten times as many, and a limit is missed by more than two
 seconds; a tenth, and steps that would end within them are lost."""
-LAST = 0.4
+LAST_STEP_SECONDS = 0.4
 """Seconds that each step after the limit has, of those that say what is known: the proof of the last decision, its
 bound, the worst cases. Ten times as many, and a limit is missed by more than two seconds; a tenth, and nothing is
 proven of a decision that a single look would prove."""
@@ -93,8 +93,9 @@ class Deadline:
 
     @contextmanager
     def enforced(self) -> Iterator[None]:
-        """Raise `OutOfTime` where nobody asks, as a single step may take long: `GRACE` after the end of the time, or,
-        where the time is over, `LAST` from now; and every `LAST` seconds again, where somebody went on.
+        """Raise `OutOfTime` where nobody asks, as a single step may take long: `LIMIT_GRACE_SECONDS` after the end of
+        the time, or, where the time is over, `LAST_STEP_SECONDS` from now; and every `LAST_STEP_SECONDS` seconds again,
+        where somebody went on.
 
         Within one another the innermost counts. What runs in compiled code is interrupted when it comes back: solvers
         have limits of their own for that.
@@ -102,7 +103,7 @@ class Deadline:
         if not self.bounded:
             yield
             return
-        due = max(self._end_time + GRACE, time.monotonic() + LAST)
+        due = max(self._end_time + LIMIT_GRACE_SECONDS, time.monotonic() + LAST_STEP_SECONDS)
         bell = _bells.get(threading.get_ident())
         if bell is None:
             with _hang_bell(due, self) as bell:
@@ -113,7 +114,7 @@ class Deadline:
         try:
             yield
         finally:
-            bell.ring_at(max(before[0], time.monotonic() + LAST), before[1])
+            bell.ring_at(max(before[0], time.monotonic() + LAST_STEP_SECONDS), before[1])
 
     def attempt(self, step: Callable[[], Value], otherwise: Callable[[], Value]) -> Value:
         """Return the result of ``step``, or that of ``otherwise`` where the time is over before ``step`` ends."""
@@ -131,7 +132,7 @@ class Deadline:
 
 
 class _Bell(ABC):
-    """Raises `OutOfTime` in one thread when it is ``due``, and every `LAST` seconds again."""
+    """Raises `OutOfTime` in one thread when it is ``due``, and every `LAST_STEP_SECONDS` seconds again."""
 
     due: float
     deadline: Deadline
@@ -166,7 +167,7 @@ class _AlarmBell(_Bell):
         raise self.error()
 
     def _set_timer(self) -> None:
-        signal.setitimer(signal.ITIMER_REAL, max(1e-3, self.due - time.monotonic()), LAST)
+        signal.setitimer(signal.ITIMER_REAL, max(1e-3, self.due - time.monotonic()), LAST_STEP_SECONDS)
 
     def take_down(self) -> None:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
@@ -187,7 +188,7 @@ class _ThreadBell(_Bell):
             while not self._has_ended:
                 remaining = self.due - time.monotonic()
                 if remaining <= 0.0:
-                    self.rung, self.due = True, time.monotonic() + LAST
+                    self.rung, self.due = True, time.monotonic() + LAST_STEP_SECONDS
                     self._raise(OutOfTime)
                 self._condition.wait(min(max(remaining, 0.0), threading.TIMEOUT_MAX))
 

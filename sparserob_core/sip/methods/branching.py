@@ -26,10 +26,10 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 from sparserob_core.sip.working.counting import MISSED, convex_below, prices_of, vectors, whole
 
-SECONDS = 20.0  # that a mixed-integer program may take
+MIXED_INTEGER_SECONDS = 20.0  # that a mixed-integer program may take
 INTEGRAL = 1e-6  # of an entry's range, within which it is 0 or a letter
 IMPOSSIBLE = 1e-9  # of the numbers that cancel in it, what a proof of infeasibility must exceed
-INWARDS = 1e-9  # of a bound, so that whoever derives it with another rounding does not find less
+PART_BOUND_ALLOWANCE = 1e-9  # of a bound, so that whoever derives it with another rounding does not find less
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class Branching:
         return min((self._round_bound(bound) for bound, _ in self._heap), default=np.inf)
 
     def _round_bound(self, bound: float) -> float:
-        return bound if np.isinf(bound) else whole(self.program, bound - INWARDS * abs(bound))
+        return bound if np.isinf(bound) else whole(self.program, bound - PART_BOUND_ALLOWANCE * abs(bound))
 
     def open(self, incumbent: float) -> bool:
         """Return whether a part may contain a decision that counts less than the ``incumbent``."""
@@ -279,7 +279,7 @@ def proposed(
         if matrix.shape[0]
     ]
     bounds = np.repeat([-np.inf, 0.0], [n, count]), np.repeat([np.inf, 1.0], [n, count])
-    seconds = SECONDS if seconds_left is None else min(SECONDS, seconds_left)
+    seconds = MIXED_INTEGER_SECONDS if seconds_left is None else min(MIXED_INTEGER_SECONDS, seconds_left)
     solution = with_integers(np.concatenate([np.zeros(n), cost]), couplings, *bounds, n, seconds, gap)
     return None if solution is None else solution[:n]
 

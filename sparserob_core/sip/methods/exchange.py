@@ -26,7 +26,7 @@ from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.working.ledger import (
-    ALLOWED,
+    SEARCH_TOLERANCE,
     CheckedAnswer,
     Found,
     Ledger,
@@ -109,7 +109,9 @@ class Rounds:
         ledger.best, x = ledger.best or answer, answer.solution.x
 
         # Separate: the constraints of the continuum that this decision violates most.
-        separations: Found = [pair for pair in separate(program, x, tools, ALLOWED, number) if not pair[0].defines]
+        separations: Found = [
+            pair for pair in separate(program, x, tools, SEARCH_TOLERANCE, number) if not pair[0].defines
+        ]
         violated: Violated = [above(*pair) for pair in separations]
         feasible = not any(rows.size for _, rows, _ in violated)
         ledger.tell(number, answer, separations, program.cost(x) if feasible else np.inf, kept=working.size)

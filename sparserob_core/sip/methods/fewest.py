@@ -14,13 +14,13 @@ from sparserob_core.sip.evidence import Cut, Proof
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.proof.branch_and_bound import CELLS, prove
+from sparserob_core.sip.proof.branch_and_bound import MAX_PROOF_CELLS, prove
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.working.counting import DUST, count, counted_below, prices_of
 from sparserob_core.sip.working.ledger import Violated
 
 TOLERANCE, ROUNDS = 1e-6, 40  # of the bound, which is told in whole pieces or with six digits
-PROPORTIONAL = 1e-12
+PROPORTIONAL = 1e-12  # relative difference of shares that are equal up to rounding
 
 
 def multiple(program: SemiInfiniteProgram) -> float | None:
@@ -50,7 +50,7 @@ class LeastCount(Method):
     cells: Mapping[str, int] = field(default_factory=dict)
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
-        def prover(x: Array, cells: int = CELLS) -> Sequence[Proof]:
+        def prover(x: Array, cells: int = MAX_PROOF_CELLS) -> Sequence[Proof]:
             fewer = count(program, x) < self.beaten * (1.0 - TOLERANCE)
             share = {name: min(cells, limit) for name, limit in self.cells.items()}
             return prove(program, x, ignore, share, tools.deadline) if fewer else ()

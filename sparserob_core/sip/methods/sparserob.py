@@ -23,7 +23,7 @@ from sparserob_core.options import Options, part
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import DECIDING, EvaluationsFinished, forwarded, frozen, ignore
 from sparserob_core.sip.evidence import Dual
-from sparserob_core.sip.limits.deadline import LAST, Deadline, OutOfTime
+from sparserob_core.sip.limits.deadline import LAST_STEP_SECONDS, Deadline, OutOfTime
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.driver import drive
 from sparserob_core.sip.program import SemiInfiniteProgram
@@ -42,8 +42,8 @@ from sparserob_core.sip.working.tightening import back_off
 
 # Of a limit, what a search leaves to the proof of what it has found. With a tenth of it a limit of
 # some seconds leaves nothing proven; ten times as much is no search.
-RESERVED = 0.1
-MOMENT = 1.0
+PROOF_SHARE_OF_LIMIT = 0.1
+MAX_PROOF_SECONDS = 1.0
 """Seconds at most that it leaves, and that an interrupt waits for what was found. With a tenth of it nothing is proven
 at an interrupt; ten times as many, and a key seems not to have been pressed."""
 
@@ -217,7 +217,9 @@ def _search_tuples(
     rules = Rules(method.sc2, method.slcr or Metropolis(), tools.polish)
     target = Target(values, g.domain, g.gradient, g.block, g.linear, g.acting)
     notify = forwarded(tools.notify, EvaluationsFinished, completed)
-    early_deadline = tools.deadline.sooner(min(MOMENT, RESERVED * (tools.deadline.seconds or 0.0)))
+    early_deadline = tools.deadline.sooner(
+        min(MAX_PROOF_SECONDS, PROOF_SHARE_OF_LIMIT * (tools.deadline.seconds or 0.0))
+    )
     ledger.relaxed.deadline = early_deadline
     report = maximise(target, tools.maximiser, tools.budget, tools.rng, rules, notify, point)
     ledger.relaxed.deadline = tools.deadline
@@ -236,7 +238,7 @@ def _save_interrupted(g: TupleValue, ledger: Ledger, point: Array, value: float,
     ledger.relaxed.deadline = Deadline()  # one last program
     if np.isfinite(value) and np.isfinite(g.at(point)):
         answer = CheckedAnswer(g.solution, g.rows(), epsilon, value)
-        grace = Deadline(max(LAST, ledger.tools.deadline.at_most(MOMENT)))
+        grace = Deadline(max(LAST_STEP_SECONDS, ledger.tools.deadline.at_most(MAX_PROOF_SECONDS)))
         ledger.keep(answer)
         tools, ledger.relaxed.deadline = replace(ledger.tools, deadline=grace, notify=ignore), grace
         with suppress(KeyboardInterrupt), grace.enforced():

@@ -39,11 +39,11 @@ from sparserob_core.sip.working.tightening import PAID
 
 PROVEN = ("certified", "verified")
 PROPOSALS = 40  # of the mixed-integer solver
-SECONDS = 20.0  # that one of its programs may take
+PROGRAM_SECONDS = 20.0  # that one of its programs may take
 # Relative gap of a proposal while none is proven. With a tenth of it a limit of seconds is over before the first one;
 # with ten times as much it is no different: any decision is closer to the least.
 ANY = 1.0
-SAME = 1e-6  # relative difference of two counts that is none
+SAME_COUNT_DIFFERENCE = 1e-6  # relative difference of two counts that is none
 
 
 class SparsestMethod(Method, Options):
@@ -167,7 +167,7 @@ class _SparsestSearch:
 
     @property
     def closed(self) -> bool:
-        return self.lower >= self.least * (1.0 - SAME)
+        return self.lower >= self.least * (1.0 - SAME_COUNT_DIFFERENCE)
 
     def root(self) -> Result | None:
         """The convex program below the count; its result where nothing is feasible."""
@@ -212,7 +212,7 @@ class _SparsestSearch:
         if self.letters is not None:
             return self._prove_letters(self._round_to_letters(image))
         key = np.packbits(is_acting[prices > 0.0]).tobytes()
-        if count_of(self.program, is_acting) >= self.least * (1.0 - SAME) or key in self.tried:
+        if count_of(self.program, is_acting) >= self.least * (1.0 - SAME_COUNT_DIFFERENCE) or key in self.tried:
             return False
         self.tried.add(key)
         method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)
@@ -221,7 +221,7 @@ class _SparsestSearch:
         is_new = self._impose_cuts([*result.indices, *result.dual.cuts])
         if result.status in PROVEN and result.decision is not None:
             new_count = count(self.program, result.decision)
-            if new_count < self.least * (1.0 - SAME):
+            if new_count < self.least * (1.0 - SAME_COUNT_DIFFERENCE):
                 self.best, self.least = result, new_count
                 self.tell()
                 return True
@@ -238,7 +238,7 @@ class _SparsestSearch:
             return False
         self.tried.add(x.tobytes())
         program, tools = self.program, self.tools
-        if count(program, x) >= self.least * (1.0 - SAME):
+        if count(program, x) >= self.least * (1.0 - SAME_COUNT_DIFFERENCE):
             return False
         separations = separate(program, x, replace(tools, notify=ignore), TOLERANCE)
         fresh: list[Cut] = []

@@ -18,7 +18,7 @@ from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation
 
-CELLS = 400_000  # cells examined per family before the proof is given up
+MAX_PROOF_CELLS = 400_000  # cells examined per family before the proof is given up
 BATCH = 4096  # cells bounded at a time
 PROBED = 16  # number of worst cells at whose centres a witness is sought
 # Rounds of bounding, from 1, in which an ascent also searches for a witness: a cell's centre may be far from the worst
@@ -32,18 +32,18 @@ CLIMBED = (
     30,
 )
 FIRST_BATCH, QUICK = 16, 0.25  # cells bounded first, and the seconds that a batch may take, where time is limited
-OFTEN = 1.0  # seconds between events within a round of bounding
+SECONDS_PER_EVENT = 1.0  # seconds between events within a round of bounding
 STALLED, ADVANCED = 30.0, 0.99  # a proof is stuck if its worst bound has not fallen to this share within these seconds
 MORE = "more seconds (limits.seconds) would help"
 ADVICE = "a larger method.tolerance would help, as it keeps decisions farther away, or narrower index sets"
-SHARPENED = 3  # rounds for sharper bounds than a proof needs: ten more follow violations to their last digits
+SHARPENING_ROUNDS = 3  # rounds for sharper bounds than a proof needs: ten more follow violations to their last digits
 # Halvings without progress after which the difference between bound and violation counts as rounding, and the largest
 # such difference, or such bound, in the units of the rows.
 REST, TINY = 8, 1e-5
 # Share of the excess of a tiny bound that may still fall with the size of a cell. With ten times as much, a proof
 # reports a larger bound than necessary, and decisions keep a larger distance; with a tenth, more cells are needed.
 FALLING = 0.06
-MOVES = 24  # largest number of steps of such an ascent
+MAX_ASCENT_STEPS = 24  # largest number of steps of such an ascent
 MAX_CUT = 32  # largest number of open cells that are divided towards peaks
 SHARE, GROWN = 0.8, (1 / 16, 1.0)  # share of the allowed length of such parts; relative growth from part to part
 _NOWHERE = Separation(np.zeros((0, 1)), np.zeros(0, dtype=int), np.zeros(0))
@@ -53,7 +53,7 @@ def prove(
     program: SemiInfiniteProgram,
     x: Array,
     notify: Notify = ignore,
-    cells: int | Mapping[str, int] = CELLS,
+    cells: int | Mapping[str, int] = MAX_PROOF_CELLS,
     deadline: Deadline | None = None,
 ) -> tuple[Proof, ...]:
     """Prove or refute every family at a decision.
@@ -107,7 +107,7 @@ def supremum(
     tolerance: float,
     least: float = 0.0,
     notify: Notify = ignore,
-    cells: int = CELLS,
+    cells: int = MAX_PROOF_CELLS,
     deadline: Deadline | None = None,
 ) -> Supremum:
     """Enclose the largest violation of a family over its whole index set.
@@ -150,7 +150,11 @@ def supremum(
 
 
 def prove_family(
-    family: ConstraintFamily, x: Array, notify: Notify = ignore, cells: int = CELLS, deadline: Deadline | None = None
+    family: ConstraintFamily,
+    x: Array,
+    notify: Notify = ignore,
+    cells: int = MAX_PROOF_CELLS,
+    deadline: Deadline | None = None,
 ) -> Proof:
     """Bound the violation of one family over its whole index set.
 
@@ -317,7 +321,7 @@ class NoViolation:
 
     Cells are closed where nothing is, and a violation of more than `TOLERANCE` ends the search. A violation between the
     two may be rounding. Cells are closed at the share ``sharpness`` of ``allowed``, until that alone has kept cells
-    open for `SHARPENED` rounds.
+    open for `SHARPENING_ROUNDS` rounds.
     """
 
     allowed: float = TOLERANCE
@@ -326,7 +330,7 @@ class NoViolation:
     def closes(self, best: float, rounds: int = 0) -> float:
         """Return the bound up to which a cell is closed, after so many ``rounds`` in which only sharpness was missing;
         ``best`` is the largest violation found."""
-        return self.sharpness * self.allowed if rounds < SHARPENED else self.allowed
+        return self.sharpness * self.allowed if rounds < SHARPENING_ROUNDS else self.allowed
 
     def ends(self, best: float) -> bool:
         """Return whether the largest violation found decides the question."""
@@ -399,7 +403,7 @@ def _branch_and_bound(
         bounds, split, bend = _bound_cells(course, x, lower, upper)
         bounds = np.minimum(bounds, parent_bounds)  # a part violates no more than the whole
         course.examined += bounds.size
-        rest += int(bounds.max(initial=-np.inf) <= goal.closes(best[0], SHARPENED))
+        rest += int(bounds.max(initial=-np.inf) <= goal.closes(best[0], SHARPENING_ROUNDS))
         open_ = bounds > goal.closes(best[0], rest)
 
         # Search for a witness: where separation finds the largest violations, and in the worst cells.
@@ -519,7 +523,7 @@ def _bound_cells(course: Course, x: Array, lower: Array, upper: Array) -> tuple[
         start, ended = stop, time.perf_counter()
         if course.deadline.bounded:
             size = min(BATCH, 2 * size) if ended - started < QUICK else max(1, size // 2)
-        if start < count and ended - course.told > OFTEN:
+        if start < count and ended - course.told > SECONDS_PER_EVENT:
             at = order[bounds[order[:start]].argmax()]
             course.tell(count, float(bounds[at]), lower[at], upper[at], start)
     return bounds, split, bend if has_bend else None
@@ -595,7 +599,7 @@ def _climb(family: ConstraintFamily, x: Array, lower: Array, upper: Array) -> tu
     """
     box, point, radius = family.index_set, (lower + upper) / 2, upper - lower
     best = (-np.inf, point, 0)
-    for _ in range(MOVES):
+    for _ in range(MAX_ASCENT_STEPS):
         star = np.clip(np.vstack([point, point + np.diag(radius), point - np.diag(radius)]), box.lower, box.upper)
         values = family.violations(x, star)
         ahead, behind = values[1:].max(axis=1).reshape(2, -1)

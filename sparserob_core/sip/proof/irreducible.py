@@ -8,14 +8,14 @@ import numpy as np
 
 from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.inner.duality import farkas_bound, farkas_proof, homogeneous, measure
-from sparserob_core.sip.inner.solve import TURNS, elastic_program, unrelaxed
+from sparserob_core.sip.inner.solve import SIMPLEX_STEPS_PER_ROW, elastic_program, unrelaxed
 from sparserob_core.sip.inner.vertex import simplex
 from sparserob_core.sip.proof.reasons import reasons
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 
 # Number of rows above which a proof with fewer rows is sought first: the filter solves a program for each row.
 # With a tenth of it, a vertex is sought where the filter takes a moment; with ten times as many, it takes minutes.
-MANY = 40
+MAX_FILTERED_ROWS = 40
 
 
 def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -> tuple[Rows, FiniteSolution, bool]:
@@ -76,10 +76,10 @@ def _move_to_vertex(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolutio
     positive than that program has variables: one more than the decision has.
     """
     fixed, size = relaxed.program.finite.h.size, np.count_nonzero(solution.y)
-    if size <= MANY:
+    if size <= MAX_FILTERED_ROWS:
         return solution
     finite = relaxed.finite(rows.G, rows.h, 0.0)
-    corner = simplex(elastic_program(finite), TURNS * (finite.n + finite.h.size))
+    corner = simplex(elastic_program(finite), SIMPLEX_STEPS_PER_ROW * (finite.n + finite.h.size))
     if corner.status != "optimal":
         return solution
     x, y, mu, z = unrelaxed(finite, (corner.x, corner.y, corner.mu, corner.z))

@@ -20,11 +20,11 @@ from sparserob_core.sip.program import ConstraintFamily, Explanation, SemiInfini
 from sparserob_core.sip.relaxed.relaxed import Rows
 
 Kind: TypeAlias = Literal["beyond every decision", "nothing between", "out of reach"]
-LOOKED_AT = 2000  # largest number of indices of a family
-NONE = 1e-13  # of a family's largest row: size of a row that the decision does not enter
-PARALLEL = 1e-12  # two unit rows are opposite when their sum is shorter than this
+MAX_INDICES = 2000  # largest number of indices of a family
+EMPTY_ROW_SIZE = 1e-13  # of a family's largest row: size of a row that the decision does not enter
+OPPOSITE_ROWS_SUM = 1e-12  # two unit rows are opposite when their sum is shorter than this
 REAL = 1e-8  # of the numbers that cancel: violation that is no rounding
-DENSE = 200  # largest number of rows judged one by one, where the image is not the decision itself
+MAX_SINGLE_ROWS = 200  # largest number of rows judged one by one, where the image is not the decision itself
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Reason:
 def reasons(program: SemiInfiniteProgram) -> list[Reason]:
     """Return the constraints that are impossible at corners and centres of the families' cells.
 
-    At most `LOOKED_AT` indices of a family are examined. Families without cells, and families whose rows have
+    At most `MAX_INDICES` indices of a family are examined. Families without cells, and families whose rows have
     deviations, are left out. There is at most one reason for every row of a family. Of rows that mean the same in
     several cases, only the worst is returned.
     """
@@ -85,7 +85,7 @@ def _list_reasons(base: FiniteProgram, family: ConstraintFamily) -> Iterator[Rea
     size = np.linalg.norm(G, axis=2)
     scale = REAL * np.maximum(1.0, np.abs(h))
     explained: set[int] = set()
-    empty_violation = np.where(size <= NONE * size.max(initial=0.0), -h, -np.inf)
+    empty_violation = np.where(size <= EMPTY_ROW_SIZE * size.max(initial=0.0), -h, -np.inf)
     for row in np.flatnonzero((empty_violation > scale).any(axis=0)):
         explained.add(int(row))
         yield _make_reason(
@@ -144,7 +144,7 @@ def least_of(base: FiniteProgram, G: Array, h: Array) -> Array:
             low, high = np.where(G == 0.0, 0.0, G * base.lower), np.where(G == 0.0, 0.0, G * base.upper)
         return np.asarray(np.minimum(low, high).sum(axis=1) - h)
     least = np.full(h.size, -np.inf)
-    order = np.argsort(h, kind="stable")[:DENSE]
+    order = np.argsort(h, kind="stable")[:MAX_SINGLE_ROWS]
     empty, zero = np.zeros((0, base.n)), np.zeros(0)
     for i in order:
         single = FiniteProgram(
@@ -180,7 +180,7 @@ def _choose_indices(family: ConstraintFamily) -> Array:
         return np.zeros((0, family.index_set.dimension))
     lower, upper = family.cells
     points = np.unique(np.concatenate([lower, upper, (lower + upper) / 2]), axis=0)
-    chosen = np.unique(np.linspace(0, len(points) - 1, min(len(points), LOOKED_AT)).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(points) - 1, min(len(points), MAX_INDICES)).round().astype(int))
     return np.asarray(points[chosen])
 
 
@@ -197,7 +197,7 @@ def _list_opposite_rows(G: Array, h: Array, size: Array) -> Iterator[tuple[int, 
                 share = size[:, first] / size[:, second]
                 distance = np.linalg.norm(G[:, first] + share[:, None] * G[:, second], axis=1)
                 missing = np.where(
-                    distance <= PARALLEL * size[:, first], -(h[:, first] + share * h[:, second]), -np.inf
+                    distance <= OPPOSITE_ROWS_SUM * size[:, first], -(h[:, first] + share * h[:, second]), -np.inf
                 )
             yield first, second, share, np.where(np.isnan(missing), -np.inf, missing)
 

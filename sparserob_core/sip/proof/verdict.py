@@ -24,7 +24,7 @@ from sparserob_core.sip.result import MEANING, Result, Status
 # Difference allowed between a row and the same row chosen among others, relative to its largest entry. With ten times
 # as much, the error of a bound exceeds a certified gap; with a tenth, sums in another order are refused.
 CHOSEN = 1e-9
-NAMED = 6  # largest number of reasons, or of members with the largest multipliers, that are named
+MAX_NAMED_REASONS = 6  # largest number of reasons, or of members with the largest multipliers, that are named
 
 
 def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Status, str]:
@@ -96,7 +96,7 @@ def remarked(program: SemiInfiniteProgram, result: Result) -> Result:
     if not names or result.status not in ("certified", "verified"):
         return result
     warning = "; ".join(
-        f"what {', '.join(of[:NAMED])}{', ...' if len(of) > NAMED else ''} {what} is believed"
+        f"what {', '.join(of[:MAX_NAMED_REASONS])}{', ...' if len(of) > MAX_NAMED_REASONS else ''} {what} is believed"
         for what, of in names.items()
     )
     return replace(result, message=f"{result.message}; {warning}")
@@ -231,8 +231,8 @@ def infeasible_subsystem(
     """Return the reasons for infeasibility, and the most important constraint.
 
     A single imposed row that no decision meets is returned alone, where its violation is larger than that of any reason
-    that needs no solver. Otherwise the first `NAMED` of these reasons are returned. Where there is none, the rows that
-    cannot hold together are returned, with the demand of their weighted sum on the decision.
+    that needs no solver. Otherwise the first `MAX_NAMED_REASONS` of these reasons are returned. Where there is none,
+    the rows that cannot hold together are returned, with the demand of their weighted sum on the decision.
 
     Parameters
     ----------
@@ -272,8 +272,8 @@ def infeasible_subsystem(
             text = sentence("out of reach", family, rows.take(np.array([i])), np.ones(1), violation)
             return InfeasibleSubsystem(reasons=(text,)), _make_worst_constraint(program, rows.cuts[i], violation)
     if evident:
-        texts = tuple(reason.text for reason in evident[:NAMED])
-        subsystem = InfeasibleSubsystem(reasons=texts, others=max(0, len(evident) - NAMED))
+        texts = tuple(reason.text for reason in evident[:MAX_NAMED_REASONS])
+        subsystem = InfeasibleSubsystem(reasons=texts, others=max(0, len(evident) - MAX_NAMED_REASONS))
         return subsystem, _make_worst_constraint(program, evident[0].rows.cuts[0], evident[0].amount)
     if not active.size:
         return InfeasibleSubsystem(amount=amount, equalities=equalities), None
@@ -292,7 +292,7 @@ def _describe_subsystem(
     """
     from sparserob_core.sip.proof.reasons import least_of, least_within
 
-    explanations = [_explain_cut(program, rows.cuts[i]) for i in order[:NAMED]]
+    explanations = [_explain_cut(program, rows.cuts[i]) for i in order[:MAX_NAMED_REASONS]]
     units = np.array([program.family(cut.family).row_unit(cut.row) for cut in rows.cuts])
     y = multipliers / units
     share = 1.0 / y.max()
@@ -304,14 +304,16 @@ def _describe_subsystem(
     demand, decides = "", explanations[0].decides
     if missing > 0 and required > 0:
         required_text, available_text = told_apart(required, required - missing)
-        named = ", ".join(f"{y[i]:.3g}" for i in order[:NAMED]) + (", ..." if order.size > NAMED else "")
+        named = ", ".join(f"{y[i]:.3g}" for i in order[:MAX_NAMED_REASONS]) + (
+            ", ..." if order.size > MAX_NAMED_REASONS else ""
+        )
         demand = (
             f"weighted by {named} they ask the {decides} for {required_text}, and it can give at most {available_text}"
         )
     return InfeasibleSubsystem(
         members=tuple(explanation.text for explanation in explanations),
         amount=amount,
-        others=max(0, order.size - NAMED),
+        others=max(0, order.size - MAX_NAMED_REASONS),
         equalities=bool(program.finite.b.size),
         demand=demand,
         decides=decides,

@@ -1,8 +1,8 @@
 """``g`` at many tuples, here or on workers, to the same last bit.
 
 A relaxed program starts from the solution of the one before, so a value depends, within the solver's accuracy, on what
-was evaluated before it. A long batch is therefore cut into chunks of `CHUNK` tuples, each begun from nothing: what a
-chunk gives depends on nothing but its tuples, and not on where, when or beside what it is evaluated.
+was evaluated before it. A long batch is therefore cut into chunks of `CHUNK_TUPLES` tuples, each begun from nothing:
+what a chunk gives depends on nothing but its tuples, and not on where, when or beside what it is evaluated.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from sparserob_core.sip.relaxed.relaxed import Imposed, RelaxedProgram
 from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
 from sparserob_core.sip.solver import Unanswered
 
-CHUNK = 16
+CHUNK_TUPLES = 16
 """Tuples that are evaluated one after the other from nothing."""
-LONG = 2 * CHUNK
+MIN_CHUNKED_TUPLES = 2 * CHUNK_TUPLES
 """Tuples of a batch that is cut into chunks; in a shorter one each starts from the one before, which is quicker."""
-WORTH = 0.1
+MIN_SECONDS_FOR_WORKERS = 0.1
 """Seconds of work that a batch must have left to be sent to workers."""
 START = 5.0
 """Seconds of work that a search must have left for workers to be started, who build the program anew."""
@@ -137,10 +137,10 @@ class Batches:
     def values(self, points: Array, tell: Callable[[float, Dual | None], None]) -> Array:
         """``g`` at points ``(k, D width)``; ``tell`` is told each value in order, with the lower bound that its
         multipliers prove where it is the best one so far."""
-        if len(points) < LONG:
+        if len(points) < MIN_CHUNKED_TUPLES:
             return np.concatenate([self._report_values(self._evaluate_next(point), tell) for point in points])
         best = self._best
-        chunks = [points[first : first + CHUNK] for first in range(0, len(points), CHUNK)]
+        chunks = [points[first : first + CHUNK_TUPLES] for first in range(0, len(points), CHUNK_TUPLES)]
         start = time.perf_counter()
         values = [self._report_values(value_chunk(self.g, chunks[0], best), tell)]
         seconds = time.perf_counter() - start
@@ -178,9 +178,9 @@ class Batches:
         """Return whether the chunks are to be sent to workers, when one chunk took ``seconds``; charge the ``points``
         to the budget."""
         self.budget -= points
-        if self.executor is None or self.oracle is None or seconds * chunks < WORTH:
+        if self.executor is None or self.oracle is None or seconds * chunks < MIN_SECONDS_FOR_WORKERS:
             return False
-        self._has_started = self._has_started or seconds * (chunks + max(self.budget, 0) / CHUNK) >= START
+        self._has_started = self._has_started or seconds * (chunks + max(self.budget, 0) / CHUNK_TUPLES) >= START
         return self._has_started
 
     def _evaluate_on_workers(self, chunks: Sequence[Array], best: float) -> Sequence[Valued]:

@@ -15,7 +15,7 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import ConstraintFamily, Enclosure, SemiInfiniteProgram, Separation
 
 Programs: TypeAlias = Callable[[float], SemiInfiniteProgram]
-KEPT = 4  # programs that are remembered, those asked for last
+PROGRAMS_KEPT = 4  # programs that are remembered, those asked for last
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class ParametricProgram:
     def program(self, factor: float) -> SemiInfiniteProgram:
         """The program at a factor, remembered."""
         if factor not in self._programs:
-            if len(self._programs) >= KEPT:
+            if len(self._programs) >= PROGRAMS_KEPT:
                 self._programs.pop(next(iter(self._programs)))
             self._programs[factor] = self.at(factor)
         return self._programs[factor]

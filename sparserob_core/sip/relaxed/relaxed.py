@@ -25,7 +25,7 @@ from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import SMALL_COST
-from sparserob_core.sip.solver import ROUNDING, AccountedSolver, Solver
+from sparserob_core.sip.solver import RESIDUAL_ROUNDING, AccountedSolver, Solver
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -35,7 +35,7 @@ LAZY = 1e-9  # rows violated by less than this, relative to their norm, are not 
 # much is more than a gap that counts as closed; a hundredth of it is lost in rounding.
 UNCLOSED = 1e-9
 RELAXED = "relaxed"  # what these programs are called where a solver fails on some
-ROUNDS = 200  # lazy additions at most within one evaluation
+MAX_LAZY_ROUNDS = 200  # lazy additions at most within one evaluation
 # of them, those that also drop the rows without a multiplier; later rows are only added, so that nothing can cycle
 DROPPING = 20
 
@@ -186,7 +186,7 @@ def _bound_free_slopes(plain: FiniteProgram, y: Array, mu: Array, x: Array) -> f
     slope = plain.q + used @ plain.G + mu @ plain.A
     noise = np.abs(plain.q) + used @ np.abs(plain.G) + np.abs(mu) @ np.abs(plain.A)
     size = np.where(np.isfinite(x), np.abs(x), 0.0)
-    return float((2.0 * (np.abs(slope) + ROUNDING * noise) * size)[free].sum())
+    return float((2.0 * (np.abs(slope) + RESIDUAL_ROUNDING * noise) * size)[free].sum())
 
 
 @dataclass(eq=False)
@@ -325,7 +325,7 @@ class RelaxedProgram:
         total = float(y[used] @ (np.abs(plain.h[used]) + np.abs(plain.G[used]) @ size))
         if mu.size:
             total += float(np.abs(mu) @ (np.abs(plain.b) + np.abs(plain.A) @ size))
-        return ROUNDING * total
+        return RESIDUAL_ROUNDING * total
 
     @shaped
     def dual(
@@ -388,7 +388,7 @@ class RelaxedProgram:
         multipliers are."""
         norms = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny) if norms is None else norms
         positions, guess = start.positions, self._build_guess(start)
-        for number in range(ROUNDS):
+        for number in range(MAX_LAZY_ROUNDS):
             solution = self._solve_rows(G[positions], h[positions], epsilon, guess)
             multipliers = (
                 solution.y[solution.y.size - positions.size :]

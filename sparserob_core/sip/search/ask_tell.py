@@ -30,9 +30,10 @@ from sparserob_core.sip.search.ranges import Ranges
 Search: TypeAlias = Callable[[Callable[[Array], Array]], Report]
 Key: TypeAlias = tuple[float, ...]
 
-FORMAT = 1
+FORMAT = 1  # the version of `state`, by which older ones are read
 WORDS = {np.inf: "inf", -np.inf: "-inf"}
-GRACE = 5.0  # seconds that a maximiser may take to end; in many coordinates one of its steps may take a tenth or more
+# Seconds that a maximiser may take to end; in many coordinates one of its steps may take a tenth or more
+SEARCH_GRACE_SECONDS = 5.0
 LATER = {  # keys that older states lack, with their defaults
     "minimise": False,
     "integer": [],
@@ -65,7 +66,7 @@ class _SearchThread:
         """End the thread, whatever it waits for."""
         self.answers.put(None)
         if self.thread.is_alive() and self.thread is not threading.current_thread():
-            self.thread.join(GRACE)
+            self.thread.join(SEARCH_GRACE_SECONDS)
 
     def _run(self) -> None:
         try:

@@ -11,9 +11,9 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.maximiser import LinearBlocks, Objective
 
 GAIN = 1e-9  # relative improvement from which a step counts as a gain
-PATIENCE = 12  # least number of steps without a gain before the ascent ends
+MIN_IDLE_STEPS = 12  # least number of steps without a gain before the ascent ends
 OCTAVES = 40.0  # halvings of a side from the farthest to the nearest neighbour of a block that acts
-GOLDEN = (5.0**0.5 - 1.0) / 2.0
+GOLDEN_SECTION = (5.0**0.5 - 1.0) / 2.0
 
 
 def block_ascent(objective: Objective, start: Array | None = None) -> bool:
@@ -52,7 +52,7 @@ def block_ascent(objective: Objective, start: Array | None = None) -> bool:
     value = float(objective.evaluate(best[np.newaxis])[0])
     if not np.isfinite(value):
         return False
-    while stalls < PATIENCE or tried < 2.0 * OCTAVES:
+    while stalls < MIN_IDLE_STEPS or tried < 2.0 * OCTAVES:
         acts = linear.acting()
         objective.note(acting=float(acts.sum()))
         trial = linear.steepest(idle.placed(best, acts))
@@ -120,7 +120,7 @@ class IdleBlocks:
             number = self.near_count + np.arange(near_blocks.size)
             turn, owner = np.divmod(number, acting.size)
             pair, axis = np.divmod(turn, self.others.size)
-            octave = 1.0 + (OCTAVES - 1.0) * np.mod(pair * GOLDEN, 1.0)
+            octave = 1.0 + (OCTAVES - 1.0) * np.mod(pair * GOLDEN_SECTION, 1.0)
             blocks[near_blocks], axes = blocks[acting[owner]], self.others[axis]
             blocks[near_blocks, axes] += (
                 np.where(pair % 2, 1.0, -1.0) * (upper - lower)[near_blocks, axes] * 2.0**-octave

@@ -12,7 +12,7 @@ from sparserob_core.errors import PluginError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.maximiser import Maximiser, Objective
 
-WORST = 1e20  # loss where the function has no value; it is finite, since some optimisers compute with it
+ABSENT_VALUE_LOSS = 1e20  # loss where the function has no value; it is finite, since some optimisers compute with it
 
 
 class AskTellOptimiser(Protocol):
@@ -132,8 +132,8 @@ class _UnitObjective:
         return np.asarray(np.clip((self.objective.best_point - self.lower) / self.width, 0.0, 1.0))
 
     def losses(self, points: Array) -> Array:
-        """Return the losses ``(k,)``, at most `WORST` in size, at points ``(k, d)``, which are moved to the unit
-        box."""
+        """Return the losses ``(k,)``, at most `ABSENT_VALUE_LOSS` in size, at points ``(k, d)``, which are moved to the
+        unit box."""
         inside = np.clip(np.nan_to_num(points, nan=0.5), 0.0, 1.0)
         placed = np.clip(self.lower + inside * self.width, self.lower, self.objective.domain.upper)
-        return np.clip(-self.objective.evaluate(placed), -WORST, WORST)
+        return np.clip(-self.objective.evaluate(placed), -ABSENT_VALUE_LOSS, ABSENT_VALUE_LOSS)

@@ -16,15 +16,15 @@ from sparserob_core.sip.search.trust_region import TrustRegion
 
 MODELLED = 30
 """Largest number of coordinates for which quadratics are fitted."""
-APART = 0.03
+MIN_START_DISTANCE = 0.03
 """Least difference of two starts in some coordinate, as a share of the box."""
 STARTS = 30
-AFFORDED = 8
+EVALUATIONS_PER_COORDINATE = 8
 """Least number of remaining evaluations for each coordinate, of which a crossing takes one. With fewer, the next start
 gains more."""
 CONSIDERED = 2000
 """Number of best evaluated points among which starts and neighbours are chosen."""
-LONGEST = 20.0
+BOX_SIDE = 20.0
 """Side of the unit box in the coordinates of a quasi-Newton method, whose first step has length 1."""
 
 
@@ -78,7 +78,7 @@ class _Evaluations:
         for point in self.points[order[1:]]:
             if len(chosen) == STARTS:
                 break
-            if (np.abs(chosen - point).max(axis=1) >= APART).all():
+            if (np.abs(chosen - point).max(axis=1) >= MIN_START_DISTANCE).all():
                 chosen = np.vstack([chosen, point])
         return chosen
 
@@ -124,8 +124,8 @@ def _ascend(evaluations: _Evaluations) -> None:
     lowest = float(evaluations.values.min())
 
     def descent(scaled: Array) -> tuple[float, Array]:
-        value, gradient = evaluations.with_gradient(scaled / LONGEST)
-        return -max(value, lowest), -gradient / LONGEST
+        value, gradient = evaluations.with_gradient(scaled / BOX_SIDE)
+        return -max(value, lowest), -gradient / BOX_SIDE
 
     for start in evaluations.starts():
         if not evaluations.objective.remaining:
@@ -190,14 +190,14 @@ class _BlockLoss:
 
     def __call__(self, scaled: Array) -> tuple[float, Array]:
         point = self.start.point.copy()
-        point[self.free] = scaled / LONGEST
+        point[self.free] = scaled / BOX_SIDE
         point = self.idle.placed(point, self.start.acts)
         value, gradient = self.evaluations.with_gradient(point)
         if value > self.best.value:
             self.best = _AscentPoint(point, value, self.acting())
             if (self.best.acts & ~self.start.acts).any():
                 raise _NewBlockError
-        return -max(value, self.lowest), -gradient[self.free] / LONGEST
+        return -max(value, self.lowest), -gradient[self.free] / BOX_SIDE
 
 
 def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array, most: int) -> None:
@@ -206,10 +206,10 @@ def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array, most: 
 
     minimize(
         loss,
-        start * LONGEST,
+        start * BOX_SIDE,
         jac=True,
         method="L-BFGS-B",
-        bounds=[(0.0, LONGEST)] * start.size,
+        bounds=[(0.0, BOX_SIDE)] * start.size,
         options={"maxfun": most, "maxiter": most, "ftol": 1e-16, "gtol": 0.0},
     )
 
@@ -222,7 +222,9 @@ def _climb(evaluations: _Evaluations) -> None:
     """
     _climb_and_cross(evaluations, evaluations.top)
     for guess in separable_maxima(evaluations.points, evaluations.values):
-        if evaluations.objective.remaining >= AFFORDED * evaluations.dimension and _cross(evaluations, guess):
+        if evaluations.objective.remaining >= EVALUATIONS_PER_COORDINATE * evaluations.dimension and _cross(
+            evaluations, guess
+        ):
             _climb_and_cross(evaluations, evaluations.top)
     for start in evaluations.starts()[1:]:
         _climb_and_cross(evaluations, start)
@@ -238,7 +240,7 @@ def _climb_and_cross(evaluations: _Evaluations, start: Array) -> None:
 def _climb_from(evaluations: _Evaluations, start: Array) -> Array:
     """Return the end ``(d,)`` of an ascent, which stops once it can no longer exceed the best value."""
     points, values = evaluations.below(start)
-    region, progress, window = TrustRegion(2 * APART), [float(values.max())], 2 * evaluations.dimension + 4
+    region, progress, window = TrustRegion(2 * MIN_START_DISTANCE), [float(values.max())], 2 * evaluations.dimension + 4
     while evaluations.objective.remaining:
         point = region.propose(points, values)
         if point is None:
@@ -262,7 +264,7 @@ def _cross(evaluations: _Evaluations, other: Array) -> bool:
     for block in np.unique(evaluations.blocks):
         best = evaluations.top
         trial = np.where(evaluations.blocks == block, other, best)
-        if not evaluations.objective.remaining or np.abs(trial - best).max() < APART:
+        if not evaluations.objective.remaining or np.abs(trial - best).max() < MIN_START_DISTANCE:
             continue
         before = float(evaluations.values.max())
         has_improved = evaluations.evaluate(trial) > before or has_improved

@@ -13,7 +13,7 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import SKETCHED, Batch, EvaluationsFinished, Notify, Phase, Sketch, frozen
 
 SECONDS_BETWEEN_EVENTS = 0.05
-EVENTS = 20  # least number of events of one search that evaluates its points one after the other
+MIN_EVENTS = 20  # least number of events of one search that evaluates its points one after the other
 NUMBERS_BETWEEN_EVENTS = 2**21  # largest number of coordinates that wait for the next event
 
 
@@ -81,7 +81,7 @@ class Notifier:
         """
         return (
             time.monotonic() - self.notified_at > SECONDS_BETWEEN_EVENTS
-            or evaluations - self.notified >= max(1, budget // EVENTS)
+            or evaluations - self.notified >= max(1, budget // MIN_EVENTS)
             or self.numbers > NUMBERS_BETWEEN_EVENTS
         )
 

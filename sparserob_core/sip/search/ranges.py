@@ -14,7 +14,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box
 
-HALF = 0.5  # an interval of length 1 rounds to each whole number of a range, at its ends too
+HALF_STEP = 0.5  # an interval of length 1 rounds to each whole number of a range, at its ends too
 
 
 @final
@@ -75,8 +75,8 @@ class Ranges:
         """Box that the maximiser searches."""
         lower, upper = self.domain.lower.copy(), self.domain.upper.copy()
         moving = [i for i in self.integer if lower[i] < upper[i]]
-        lower[moving] -= HALF
-        upper[moving] += HALF
+        lower[moving] -= HALF_STEP
+        upper[moving] += HALF_STEP
         lower[self.logarithmic], upper[self.logarithmic] = (
             np.log(lower[self.logarithmic]),
             np.log(upper[self.logarithmic]),

@@ -11,7 +11,7 @@ from sparserob_core.sip.convex_set import Array
 KNOTS = (40, 20, 10)
 """Numbers of knots of a function of one coordinate. Twice as many resolve hills of half the width, and need twice as
 many points."""
-POINTS = 1.5
+POINTS_PER_UNKNOWN = 1.5
 """Points for each unknown of a fit. With fewer, the part of the values that is not separable determines the maximum."""
 RIDGE = 1e-3
 """Regularisation of constants that the functions may exchange, and of knots without points. A value a thousand times
@@ -49,7 +49,7 @@ def separable_maxima(points: Array, values: Array) -> Iterator[Array]:
         return
     scaled /= spread
     for knots in KNOTS:
-        if count < POINTS * knots * dimension:
+        if count < POINTS_PER_UNKNOWN * knots * dimension:
             continue
         places = points * (knots - 1)
         lower_knots = np.minimum(places.astype(int), knots - 2)

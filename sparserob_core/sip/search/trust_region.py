@@ -10,14 +10,14 @@ from sparserob_core.sip.convex_set import Array
 
 FIRST, LARGEST = 0.1, 0.3
 """Largest first radius, and largest radius, as shares of the box."""
-SMALLEST = 1e-13
+SMALLEST_RADIUS = 1e-13
 """Radius in the unit box below which no improvement is possible in double precision."""
 SURPLUS = 1.5
 """Number of points of a model for each of its coefficients. Interpolation needs fewer, but a few more points fit a
 function with kinks better."""
-POINTS = 99
+MAX_MODEL_POINTS = 99
 """Largest number of points of a model: one and a half times the coefficients of a full quadratic in ten coordinates."""
-ITERATIONS = 40  # largest number of Newton steps for the length of a step
+STEP_LENGTH_ITERATIONS = 40  # largest number of Newton steps for the length of a step
 SLOPE_OVER_CURVATURE = 10.0
 """Price of curvature relative to that of slope, where the points do not determine the model."""
 
@@ -96,7 +96,7 @@ class TrustRegion:
         if not self.radius:
             self.radius = min(FIRST, 0.95 * float(distances.max(initial=0.0))) or FIRST
         lower, upper = -points[top], 1.0 - points[top]
-        while self.radius >= SMALLEST:
+        while self.radius >= SMALLEST_RADIUS:
             step = _find_missing_direction(offsets, distances, self.radius, lower, upper) if self._has_failed else None
             self._is_spanning = step is not None
             if step is None:
@@ -133,7 +133,7 @@ def _find_neighbours(points: Array, values: Array, top: int) -> tuple[Array, Arr
     offsets = points - points[top]
     squares = np.einsum("ij,ij->i", offsets, offsets)
     coefficients = dimension * (dimension + 3) // 2
-    count = 1 + min(int(SURPLUS * coefficients), max(POINTS, 2 * dimension))
+    count = 1 + min(int(SURPLUS * coefficients), max(MAX_MODEL_POINTS, 2 * dimension))
     nearest = np.argpartition(squares, count - 1)[:count] if len(points) > count else np.arange(len(points))
     nearest = nearest[np.argsort(squares[nearest], kind="stable")]
     nearest = nearest[squares[nearest] > 0.0]
@@ -263,7 +263,7 @@ def _step_to_sphere(slope: Array, curvature: Array, radius: float, least: float)
     Newton's method on the inverse of the length finds the shift from the left.
     """
     shift = least
-    for _ in range(ITERATIONS):
+    for _ in range(STEP_LENGTH_ITERATIONS):
         inner = slope / (curvature + shift)
         length = float(np.sqrt(inner @ inner))
         if length <= radius * (1.0 + 1e-6):

@@ -16,12 +16,12 @@ Rows: TypeAlias = npt.NDArray[Any]
 Truths: TypeAlias = npt.NDArray[np.bool_]
 VectorFunction: TypeAlias = Callable[[Array], Array]
 
-STEPS = 80
-REACH = 2.0
+MAX_REFINEMENT_STEPS = 80  # of a climb to a maximum
+MAX_STEP_RADII = 2.0
 """Longest step, in radii and per coordinate."""
 FARTHER = 2.0
 """Of its radius, that of the next step of who has moved as far as it lets: with 1 a crest is crept along for ever."""
-ACCURACY = 1e-14
+PEAK_ACCURACY = 1e-14
 HOPELESS = 8.0
 """Times the variation of a model by which its maximum may lie above its best point. With an eighth of it narrow peaks
 are given up; with ten times as much nothing is."""
@@ -92,7 +92,7 @@ def refine(function: VectorFunction, candidates: Candidates, least: float = -np.
     curvature = np.full((count, dimension), np.nan)
     active = np.arange(count)
     points, values, radius = candidates.points.copy(), candidates.values.copy(), candidates.radius.copy()
-    for _ in range(STEPS):
+    for _ in range(MAX_REFINEMENT_STEPS):
         now = Candidates(points[active], candidates.rows[active], values[active], radius[active])
         better, curved, is_done = _take_step(function, now, offsets, curvature[active], least)
         points[active], values[active], radius[active], curvature[active] = (
@@ -132,13 +132,15 @@ def _take_step(
     stencil = inside(middle[:, np.newaxis] + radius[:, np.newaxis] * offsets)
     stencil_values = _evaluate_points(function, stencil, now.rows)
     model = _fit_models(middle, stencil_values, offsets)
-    steps = _maximise_models(model, np.maximum(-REACH, -middle / radius), np.minimum(REACH, (1 - middle) / radius))
+    steps = _maximise_models(
+        model, np.maximum(-MAX_STEP_RADII, -middle / radius), np.minimum(MAX_STEP_RADII, (1 - middle) / radius)
+    )
     trial = inside(middle + radius * steps)
     trial_values = _evaluate_points(function, trial[:, np.newaxis], now.rows)
     scale = np.maximum(1.0, np.abs(now.values))
     curved = np.einsum("aii->ai", model.hessian) / radius**2
     change = np.abs(np.nan_to_num(curved - curvature, nan=np.inf, posinf=np.inf)).max(axis=1) * radius[:, 0] ** 2
-    is_smooth = (np.abs(trial_values[:, 0] - model.at(steps)) <= 0.05 * model.spread + ACCURACY * scale) & (
+    is_smooth = (np.abs(trial_values[:, 0] - model.at(steps)) <= 0.05 * model.spread + PEAK_ACCURACY * scale) & (
         change <= 0.1 * model.spread
     )
     points, values = _keep_best(
@@ -148,8 +150,10 @@ def _take_step(
     )
     moved_far = np.abs(points - now.points).max(axis=1) > 0.75 * radius[:, 0]
     shrink = np.where(moved_far, FARTHER, np.where(is_smooth, 0.125, 1.0 / 4))
-    is_settled = is_smooth & (model.at(steps) - values <= ACCURACY * scale) & (values - now.values <= ACCURACY * scale)
-    is_done = is_settled | (model.spread <= 10 * ACCURACY * scale) | (radius[:, 0] < ACCURACY)
+    is_settled = (
+        is_smooth & (model.at(steps) - values <= PEAK_ACCURACY * scale) & (values - now.values <= PEAK_ACCURACY * scale)
+    )
+    is_done = is_settled | (model.spread <= 10 * PEAK_ACCURACY * scale) | (radius[:, 0] < PEAK_ACCURACY)
     is_done |= values + HOPELESS * model.spread < least
     return Candidates(points, now.rows, values, radius[:, 0] * shrink), curved, is_done
 

@@ -31,7 +31,7 @@ POINTS_PER_ASKED = 4
 # Of the maxima that are returned, how many are compared, for some are found more than once. With a quarter of them,
 # what the maximiser finds again takes the place of others; ten times as many are more pairs than one wants to compare.
 MAXIMA_PER_KEPT = 4
-SAME = 1e-6
+SAME_MAXIMUM_DISTANCE = 1e-6
 """Maxima of one row that are closer than this share of the box are one maximum."""
 MAX_ARRAY = 2_000_000
 
@@ -261,7 +261,7 @@ def _select_distinct(found: Candidates, kept: int) -> Candidates:
     for row in np.unique(found.rows):
         positions = np.flatnonzero(found.rows == row)[: MAXIMA_PER_KEPT * kept]
         points = found.points[positions]
-        near = np.abs(points[:, np.newaxis] - points).max(axis=2, initial=0.0) <= SAME
+        near = np.abs(points[:, np.newaxis] - points).max(axis=2, initial=0.0) <= SAME_MAXIMUM_DISTANCE
         chosen[positions[~np.tril(near, -1).any(axis=1)][:kept]] = True
     return found.take(chosen)
 

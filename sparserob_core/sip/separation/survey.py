@@ -24,14 +24,14 @@ DEPTH = 6
 # Of the points of a grid, along each coordinate, one in so many may get a block, half as many at every level: together
 # these have then about as many points as the grid. With 1 a crest of two coordinates takes eight times as
 # long as the grid; with 10 only a single peak in a hundred is resolved.
-SHARED = 3
+POINTS_PER_BLOCK = 3
 # Of the larger of two neighbouring second differences, by how much they may differ where a grid resolves a function:
 # that is the case from some ten points a period on. With a tenth of it every grid is halved; ten times as much is true
 # everywhere.
-RESOLVED = 0.5
+MAX_DIFFERENCE_CHANGE = 0.5
 # Of the largest violation of a grid, what is worth more points in the same round. With a tenth of it early rounds cost
 # twice as much; with all of it peaks come one round after the other.
-WORTH = 0.1
+WORTHWHILE_SHARE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +73,8 @@ def survey_grid(function: VectorFunction, dimension: int, side: int, threshold: 
     """
     spacing = 1.0 / max(1, side - 1)
     level = _evaluate_level(function, np.zeros((1, dimension)), side, spacing)
-    worth, surveys = max(threshold, WORTH * float(level.values.max(initial=0.0))), [level.survey()]
-    blocks = side**dimension // SHARED**dimension
+    worth, surveys = max(threshold, WORTHWHILE_SHARE * float(level.values.max(initial=0.0))), [level.survey()]
+    blocks = side**dimension // POINTS_PER_BLOCK**dimension
     for halved in range(DEPTH if dimension and side > BLOCK_SIDE else 0):
         centres = level.unresolved(worth, max(1, blocks >> halved))
         if not len(centres):
@@ -178,7 +178,7 @@ class _Level:
             aligned[2:-1] = np.maximum(aligned[2:-1], step)
             aligned[0], aligned[-1] = aligned[1], aligned[-2]
             reach += size
-            is_coarse |= (change > RESOLVED * size) & (change > worth)
+            is_coarse |= (change > MAX_DIFFERENCE_CHANGE * size) & (change > worth)
         high = np.where(is_coarse & (reach > worth), reach, -np.inf).max(axis=-1).ravel()
         order = np.argsort(-high, kind="stable")[: min(most, int((high > -np.inf).sum()))]
         return self.points.reshape(high.size, -1)[order]

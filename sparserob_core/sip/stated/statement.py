@@ -25,7 +25,7 @@ RESERVED = ("config", "objective", "lower bound", "bounds and rows", "infeasibil
 Multiple: TypeAlias = tuple[int, float]
 """An entry of the decision, and the factor before it."""
 MAX_PAIRS = 300_000  # of entries, where products are multiplied out in fractions: ten times as many take a minute
-MAX_ENTRIES = 100_000  # of a decision with its residuals: ten times as many take a matrix of gigabytes
+MAX_STATED_ENTRIES = 100_000  # of a decision with its residuals: ten times as many take a matrix of gigabytes
 
 
 @final
@@ -118,12 +118,12 @@ class StatedProgram:
         Where products are convex only together, such as ``(x + y)*(x - y) + 2*y^2``, they are multiplied out instead.
         """
         objective, n = self.objective, self._words.decisions.n
-        if n > MAX_ENTRIES:
-            raise InputError(path="decision", expected=f"at most {MAX_ENTRIES} entries", got=f"{n}")
+        if n > MAX_STATED_ENTRIES:
+            raise InputError(path="decision", expected=f"at most {MAX_STATED_ENTRIES} entries", got=f"{n}")
         inner = [term for _, term in objective.absolutes]
         every = _list_distinct([term for _, left, right in objective.products for term in (left, right)] + inner)
-        if n + len(every) > MAX_ENTRIES:
-            raise InputError(path="minimise", expected=f"at most {MAX_ENTRIES} terms", got=f"{len(every)}")
+        if n + len(every) > MAX_STATED_ENTRIES:
+            raise InputError(path="minimise", expected=f"at most {MAX_STATED_ENTRIES} terms", got=f"{len(every)}")
         if objective.is_sum_of_squares or objective.count_pairs() > MAX_PAIRS:
             return every
         polynomial = objective.expand(_number_terms(every, n))

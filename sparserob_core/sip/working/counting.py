@@ -21,7 +21,7 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 
 DUST = 1e-5  # of an entry's range: what solvers leave of an entry that should be 0; nothing is claimed without a proof
 MISSED = 1e-6  # of one price: rounding error of a whole number of them
-ROUNDED = 1e-12  # of the terms of which an entry is a sum: an entry of this size is rounding, and counts as 0
+NEGLIGIBLE_ENTRY = 1e-12  # of the terms of which an entry is a sum: an entry of this size is rounding, and counts as 0
 
 
 @final
@@ -133,7 +133,7 @@ def acting(coefficients: Float[Array, "m n"], values: Float[Array, "n k"]) -> np
     ndarray of bool, shape (m, k)
         True where the product is not 0.
     """
-    return np.asarray(np.abs(coefficients @ values) > ROUNDED * (np.abs(coefficients) @ np.abs(values)))
+    return np.asarray(np.abs(coefficients @ values) > NEGLIGIBLE_ENTRY * (np.abs(coefficients) @ np.abs(values)))
 
 
 def counting(program: SemiInfiniteProgram) -> int:
@@ -162,7 +162,7 @@ def count(program: SemiInfiniteProgram, x: Array) -> float:
     """Return the count of a decision ``x (n,)``, in the user's units; entries of one vector count together."""
     base = program.finite
     terms = np.abs(x) if base.S is None else abs(base.S) @ np.abs(x)
-    return count_of(program, np.abs(base.image(x)) > ROUNDED * terms)
+    return count_of(program, np.abs(base.image(x)) > NEGLIGIBLE_ENTRY * terms)
 
 
 def count_of(program: SemiInfiniteProgram, acts: np.ndarray) -> float:
@@ -218,7 +218,7 @@ def whole(program: SemiInfiniteProgram, least: float) -> float:
 
 def _find_common_price(prices: Array) -> float:
     """Return the common price of all entries; 0 where prices differ."""
-    return float(prices.mean()) if prices.size and np.ptp(prices) <= ROUNDED * prices.max() else 0.0
+    return float(prices.mean()) if prices.size and np.ptp(prices) <= NEGLIGIBLE_ENTRY * prices.max() else 0.0
 
 
 def tidied(program: SemiInfiniteProgram, x: Array) -> Array:
@@ -238,7 +238,7 @@ def tidied(program: SemiInfiniteProgram, x: Array) -> Array:
         return np.zeros_like(x)  # least squares would leave rounding errors, and a cost that is not exactly 0
     if base.S is None:
         return np.where(is_small, 0.0, x)
-    if x.size > LARGE:
+    if x.size > MAX_IMAGE_VARIABLES:
         return x
     with np.errstate(invalid="ignore"):
         targets = np.where(is_small, 0.0, np.where(image > 0.0, base.upper, base.lower))
@@ -276,7 +276,7 @@ def met(program: SemiInfiniteProgram, x: Array, G: Array, h: Array) -> Array:
         The decision.
     """
     base = program.finite
-    if not base.b.size + h.size or (base.S is not None and x.size > LARGE):
+    if not base.b.size + h.size or (base.S is not None and x.size > MAX_IMAGE_VARIABLES):
         return x
     widths = np.where(np.isfinite(base.upper - base.lower), base.upper - base.lower, 1.0)
     image, is_free, kept_rows = base.image(x), np.ones(x.size, dtype=bool), np.zeros((0, x.size))
@@ -291,11 +291,11 @@ def met(program: SemiInfiniteProgram, x: Array, G: Array, h: Array) -> Array:
     columns, decision = np.vstack([base.A, G, kept_rows])[:, is_free], x.copy()
     sizes = np.linalg.norm(columns, axis=1)
     sizes = np.where(sizes > 0.0, sizes, 1.0)[:, None]
-    for _ in range(REFINED):
+    for _ in range(REFINEMENT_ROUNDS):
         residuals = np.concatenate([base.excess(decision), G @ decision - h, kept_rows @ (decision - x)])
         decision[is_free] -= np.linalg.lstsq(columns / sizes, residuals / sizes[:, 0], rcond=None)[0]
     return decision
 
 
-REFINED = 3
-LARGE = 2000  # largest number of variables for which images are solved
+REFINEMENT_ROUNDS = 3  # of the least squares that meet active rows: the second one corrects the rounding of the first
+MAX_IMAGE_VARIABLES = 2000  # largest number of variables for which images are solved

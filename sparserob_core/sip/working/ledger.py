@@ -24,17 +24,17 @@ from sparserob_core.sip.program import (
     Separation,
     WorstConstraint,
 )
-from sparserob_core.sip.proof.branch_and_bound import CELLS, more, prove
+from sparserob_core.sip.proof.branch_and_bound import MAX_PROOF_CELLS, more, prove
 from sparserob_core.sip.proof.verdict import as_bad_as_found, infeasible_subsystem, verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 from sparserob_core.sip.result import MEANING, Result, Status, relative_gap
 
-ROUNDING = 1e-13  # rounding error of a cost, relative to its terms
-CRUDE = 1e-8  # relative residual of bounds, rows and equalities at a decision without a claim
+COST_ROUNDING = 1e-13  # rounding error of a cost, relative to its terms
+UNCLAIMED_RESIDUAL = 1e-8  # relative residual of bounds, rows and equalities at a decision without a claim
 # Multiple of the tolerance: a violation above it contradicts a proof. With 1, rounding alone might contradict a proof;
 # with ten times as much, a violation of twenty tolerances is claimed to be none.
 CONTRADICTS = 2.0
-ALLOWED = TOLERANCE / 2  # violation that the search may leave to the proof
+SEARCH_TOLERANCE = TOLERANCE / 2  # violation that the search may leave to the proof
 
 Violated: TypeAlias = Sequence[tuple[Array, np.ndarray, str]]  # indices (k, d), rows (k,) and the name of a family
 
@@ -42,7 +42,7 @@ Violated: TypeAlias = Sequence[tuple[Array, np.ndarray, str]]  # indices (k, d),
 class Prover(Protocol):
     """Function that proves the families at a decision ``x (n,)``, with at most ``cells`` cells for each family."""
 
-    def __call__(self, x: Array, cells: int = CELLS) -> Sequence[Proof]: ...
+    def __call__(self, x: Array, cells: int = MAX_PROOF_CELLS) -> Sequence[Proof]: ...
 
 
 class Close(Protocol):
@@ -54,7 +54,7 @@ class Close(Protocol):
 Found: TypeAlias = Sequence[tuple[ConstraintFamily, Separation]]
 
 
-def unproven(x: Array, cells: int = CELLS) -> Sequence[Proof]:
+def unproven(x: Array, cells: int = MAX_PROOF_CELLS) -> Sequence[Proof]:
     """Return no proof: the prover of a program of which only the bounds are needed."""
     return ()
 
@@ -62,7 +62,7 @@ def unproven(x: Array, cells: int = CELLS) -> Sequence[Proof]:
 def prover_of(program: SemiInfiniteProgram, tools: Tools) -> Prover:
     """Return the prover of all families of a program, which sends events and ends at the deadline of the tools."""
 
-    def prover(x: Array, cells: int = CELLS) -> Sequence[Proof]:
+    def prover(x: Array, cells: int = MAX_PROOF_CELLS) -> Sequence[Proof]:
         return prove(program, x, tools.notify, cells, tools.deadline)
 
     return prover
@@ -319,8 +319,8 @@ class Ledger:
         With ``strictly``, the limit is that of a claim; otherwise it is that of a decision worth returning.
         """
         finite = self.program.finite
-        yield "its equalities", finite.equality_residual(x), EQUALITY if strictly else CRUDE
-        yield "its bounds or rows", finite.residual(x), TOLERANCE if strictly else CRUDE
+        yield "its equalities", finite.equality_residual(x), EQUALITY if strictly else UNCLAIMED_RESIDUAL
+        yield "its bounds or rows", finite.residual(x), TOLERANCE if strictly else UNCLAIMED_RESIDUAL
         yield "its bounds", _find_largest_violation(self.program, x) if strictly else 0.0, TOLERANCE
 
     def stopped(self, error: KeyboardInterrupt, prover: Prover) -> Result:
@@ -491,7 +491,7 @@ def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
         The message; empty where all is well.
     """
     base, cost = program.finite, program.cost(x)
-    allowed = ROUNDING * base.magnitude(x)
+    allowed = COST_ROUNDING * base.magnitude(x)
     allowed += sum(cut.multiplier * TOLERANCE for cut in dual.cuts)
     if dual.z is not None and base.S is not None:
         violations, rounding = _measure_bound_violations(base, x)
@@ -523,7 +523,7 @@ def _measure_bound_violations(base: FiniteProgram, x: Array) -> tuple[Array, Arr
     """Return the amounts ``(k,)`` by which the image of ``x (n,)`` violates its bounds, and their rounding errors
     ``(k,)``."""
     image, terms = base.image(x), np.abs(x) if base.S is None else abs(base.S) @ np.abs(x)
-    return np.maximum(np.maximum(base.lower - image, image - base.upper), 0.0), ROUNDING * terms
+    return np.maximum(np.maximum(base.lower - image, image - base.upper), 0.0), COST_ROUNDING * terms
 
 
 def _find_largest_violation(program: SemiInfiniteProgram, x: Array) -> float:
@@ -564,7 +564,7 @@ def above(family: ConstraintFamily, found: Separation) -> tuple[Array, np.ndarra
     name : str
         Name of the family.
     """
-    violated = found.violations > ALLOWED
+    violated = found.violations > SEARCH_TOLERANCE
     return found.indices[violated], found.rows[violated], family.name
 
 

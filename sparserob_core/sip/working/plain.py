@@ -13,7 +13,7 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Dual
 from sparserob_core.sip.finite import FiniteSolution
-from sparserob_core.sip.inner.vertex import MANY, vertex
+from sparserob_core.sip.inner.vertex import SIFTED_ENTRIES, vertex
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.verdict import worst_of
@@ -21,19 +21,28 @@ from sparserob_core.sip.relaxed.relaxed import Rows, rows_at, rows_of
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.working.counting import count, met, tidied
-from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Close, Found, Ledger, Prover, Violated, above
+from sparserob_core.sip.working.ledger import (
+    SEARCH_TOLERANCE,
+    CheckedAnswer,
+    Close,
+    Found,
+    Ledger,
+    Prover,
+    Violated,
+    above,
+)
 from sparserob_core.sip.working.working import LargestViolation, Working, fits
 
 # Number of rounds without a multiplier after which a row is dropped. With 1, rows are dropped and imposed in turn; with
 # ten times as many, solving takes longer the more rounds there were.
-IDLE_ROUNDS = 3
+ROUNDS_WITHOUT_MULTIPLIER = 3
 # Number of rounds after which rows are only added, so that nothing can cycle. With a tenth, curved constraints keep
 # more rows than they need; ten times as many are more rounds than any run has.
 DROPPING_ROUNDS = 40
 # Least ratio of two weights when several steps of the continuation are taken at once. With ten times as much, every
 # step is taken alone, with three times as many programs; with half, badly scaled programs end verified, not certified.
-FASTEST = 1 / 8
-CRUDE = 1e-4  # residual and relative gap of a relaxed solution that is accurate enough for a round
+MIN_WEIGHT_RATIO = 1 / 8
+ROUND_ACCURACY = 1e-4  # residual and relative gap of a relaxed solution that is accurate enough for a round
 SPARSIFYING = 60  # number of rounds after which no vertex is sought
 
 
@@ -139,7 +148,7 @@ class PlainRows(Working):
         once. For the regularised problem, it decreases step by step to the last weight.
         """
         solution, regu = self._solve(ledger, self.epsilon), ledger.tools.continuation
-        steps = max(1, int(np.log(FASTEST) / np.log(regu.factor))) if self.exact else 1
+        steps = max(1, int(np.log(MIN_WEIGHT_RATIO) / np.log(regu.factor))) if self.exact else 1
         while usable(solution) and self.epsilon > regu.stop and (not self.exact or ledger.open(solution.x)):
             ledger.tools.deadline.check()
             lighter = self.epsilon
@@ -169,7 +178,9 @@ class PlainRows(Working):
 
     def _solve_unregularised(self, ledger: Ledger) -> FiniteSolution:
         """Return the solution of the unregularised relaxed program; its multipliers improve the lower bound."""
-        guess = self.guess if self.program.n >= MANY else None  # its multipliers are the start of the simplex method
+        guess = (
+            self.guess if self.program.n >= SIFTED_ENTRIES else None
+        )  # its multipliers are the start of the simplex method
         plain = ledger.relaxed.solve(self.rows, 0.0, self.margin, guess)
         if usable(plain):
             ledger.improve(ledger.relaxed.lower_bound(self.rows, plain))
@@ -190,7 +201,7 @@ class PlainRows(Working):
         crude = answer.solution.status != "optimal"
         if not (crude or ledger.open(answer.solution.x)) or not usable(plain):
             return False
-        self.epsilon, self.guess = 0.0, plain if self.program.n >= MANY else None
+        self.epsilon, self.guess = 0.0, plain if self.program.n >= SIFTED_ENTRIES else None
         return True
 
     def exchange(self, answer: CheckedAnswer, violated: Violated, number: int) -> int:
@@ -201,7 +212,7 @@ class PlainRows(Working):
         multipliers, zeros = answer.multipliers, np.zeros(fresh.h.size)
         y = np.concatenate([multipliers, np.zeros(self.rows.h.size - multipliers.size)])  # zeros for rows imposed since
         idle = np.where(y > 0.0, 0, self.idle + 1)
-        keep = (idle < IDLE_ROUNDS) | (number > DROPPING_ROUNDS) | (not self.sheds)
+        keep = (idle < ROUNDS_WITHOUT_MULTIPLIER) | (number > DROPPING_ROUNDS) | (not self.sheds)
         self.rows = self.rows.take(keep).joined(fresh)
         self.idle = np.concatenate([idle[keep], zeros.astype(int)])
         fixed = answer.solution.y[: answer.solution.y.size - multipliers.size]
@@ -301,7 +312,7 @@ class PlainRows(Working):
         for candidate in candidates:
             if candidate is x or count(program, candidate) >= least or not fits(ledger, candidate):
                 continue
-            separations = separate(program, candidate, ledger.tools, ALLOWED, number)
+            separations = separate(program, candidate, ledger.tools, SEARCH_TOLERANCE, number)
             violations = [
                 constraints for family, separation in separations if (constraints := above(family, separation))[1].size
             ]
@@ -329,5 +340,5 @@ def usable(solution: FiniteSolution) -> bool:
     """
     scale = max(1.0, abs(solution.value))
     return solution.status == "optimal" or (
-        solution.status == "failed" and solution.residual <= CRUDE and solution.gap <= CRUDE * scale
+        solution.status == "failed" and solution.residual <= ROUND_ACCURACY and solution.gap <= ROUND_ACCURACY * scale
     )

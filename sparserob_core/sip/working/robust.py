@@ -21,13 +21,13 @@ from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.inner.simplex.counterpart import Counterpart, RobustAnswer, robust_bound
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, WorstConstraint
-from sparserob_core.sip.proof.verdict import NAMED, explained
+from sparserob_core.sip.proof.verdict import MAX_NAMED_REASONS, explained
 from sparserob_core.sip.relaxed.relaxed import Rows
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.solver import AccountedSolver
 from sparserob_core.sip.working.ledger import (
-    ALLOWED,
+    SEARCH_TOLERANCE,
     CheckedAnswer,
     Close,
     Found,
@@ -42,13 +42,13 @@ from sparserob_core.sip.working.working import LargestViolation, Working, size_o
 
 SHARES = (0.1, 0.5, 1.0)  # points from the best decision known to the relaxed optimum at which rows are sought
 ENDED = 0.05  # seconds after the deadline when it has passed for certain
-CUTS = 4  # largest number of rows at each of these points
+ROWS_PER_POINT = 4  # largest number of rows at each of these points
 CHOOSING = 30  # largest number of rounds of a second objective
 # Largest number of variables of a second objective. With ten times as many, the simplex method takes minutes where the
 # first objective takes seconds (100 pieces, two states: 10 000); a tenth excludes six states on twelve pieces.
-MANY = 4000
+MAX_SECOND_VARIABLES = 4000
 COARSE, SHARPER = 10.0, 0.1  # accuracy of the first round as a share of the cost, and its factor from round to round
-FINEST = 0.1  # accuracy of the last rounds as a share of the tolerance
+LAST_ACCURACY_SHARE = 0.1  # accuracy of the last rounds as a share of the tolerance
 FARKAS = 1e-9  # least violation of a weighted sum of rows that proves infeasibility
 
 
@@ -210,9 +210,13 @@ class RobustRows(Working):
             for share in SHARES:
                 candidate = share * raw + (1.0 - share) * best
                 separation = family.separated(candidate)
-                is_violated = family.violations(raw, separation.indices).max(axis=1) > ALLOWED
+                is_violated = family.violations(raw, separation.indices).max(axis=1) > SEARCH_TOLERANCE
                 violated.append(
-                    (separation.indices[is_violated][:CUTS], separation.rows[is_violated][:CUTS], family.name)
+                    (
+                        separation.indices[is_violated][:ROWS_PER_POINT],
+                        separation.rows[is_violated][:ROWS_PER_POINT],
+                        family.name,
+                    )
                 )
                 if feasible and program.settle is not None:
                     candidate = program.settle(candidate)
@@ -254,10 +258,10 @@ class RobustRows(Working):
 
     def _raise_accuracy(self, answer: CheckedAnswer, violation: float, added: bool) -> bool:
         """Return whether the next round can be more accurate; it is where new constraints change little."""
-        if not self.counterpart.approximate or self.accuracy <= FINEST * self.tolerance:
+        if not self.counterpart.approximate or self.accuracy <= LAST_ACCURACY_SHARE * self.tolerance:
             return False
         if not added or self.price * violation < self.accuracy * size_of(self.program, answer):
-            self.accuracy = max(FINEST * self.tolerance, SHARPER * self.accuracy)
+            self.accuracy = max(LAST_ACCURACY_SHARE * self.tolerance, SHARPER * self.accuracy)
         return True
 
     def impose(self, violated: Violated) -> int:
@@ -447,14 +451,14 @@ class RobustRows(Working):
         """
         second, x = self.program.among, answer.solution.x
         violated = any(above(*pair)[1].size for pair in found)
-        if second is None or second[0].n > MANY or violated or ledger.open(x):
+        if second is None or second[0].n > MAX_SECOND_VARIABLES or violated or ledger.open(x):
             return answer, found, ()
         if not ledger.prove(answer, found, prover(x, GLANCE)):
             return answer, found, ()
         decision = self._optimise_second(ledger, answer, *second)
         if decision is None or self.program.finite.residual(decision) > TOLERANCE or ledger.open(decision):
             return answer, found, ()
-        separations = separate(self.program, decision, ledger.tools, ALLOWED, number)
+        separations = separate(self.program, decision, ledger.tools, SEARCH_TOLERANCE, number)
         if any(above(*pair)[1].size for pair in separations):
             return answer, found, ()
         return self._replace_decision(answer, decision), separations, ()
@@ -483,7 +487,7 @@ class RobustRows(Working):
                 return None
             x = np.clip(solution.x, second.finite.lower, second.finite.upper)
             x = x if second.settle is None else second.settle(x)
-            violated = [above(*pair) for pair in separate(second, x, tools, ALLOWED, number)]
+            violated = [above(*pair) for pair in separate(second, x, tools, SEARCH_TOLERANCE, number)]
             violated += self._find_violated(second, x)
             if not (working.impose(violated) or counterpart.sharpen(x)):
                 break
@@ -500,7 +504,7 @@ class RobustRows(Working):
             imposed_indices = {cut.index.tobytes(): cut.index for cut in self.cuts if cut.family == family.name}
             if imposed_indices:
                 indices = np.array(list(imposed_indices.values()))
-                is_violated = family.violations(x, indices).max(axis=1) > ALLOWED
+                is_violated = family.violations(x, indices).max(axis=1) > SEARCH_TOLERANCE
                 violated.append((indices[is_violated], np.zeros(int(is_violated.sum()), dtype=int), family.name))
         return violated
 
@@ -525,10 +529,10 @@ def _describe_infeasibility(
     bare = WorstConstraint(
         dual.bound, first.family, first.index[: families[first.family].index_set.dimension], first.row
     )
-    members = tuple(explanation.text for explanation in explanations[:NAMED])
+    members = tuple(explanation.text for explanation in explanations[:MAX_NAMED_REASONS])
     subsystem = InfeasibleSubsystem(
         members=members,
-        others=max(0, len(explanations) - NAMED),
+        others=max(0, len(explanations) - MAX_NAMED_REASONS),
         equalities=bool(program.finite.b.size),
         decides="policy",
         irreducible=False,

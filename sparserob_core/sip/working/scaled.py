@@ -9,7 +9,7 @@ from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.working.robust import left
 
-ROOM = 1e3  # largest margin of the rows, in their own units
+LARGEST_ROW_MARGIN = 1e3  # largest margin of the rows, in their own units
 SLACKENED = 200  # largest number of rounds
 
 
@@ -32,7 +32,7 @@ def least_slack(program: SemiInfiniteProgram, tools: Tools, accuracy: float = 1e
         was not found.
     """
     assert program.spread is not None
-    relaxing = Counterpart(program.finite, program.spread, elastic=True, lowest=-ROOM)
+    relaxing = Counterpart(program.finite, program.spread, elastic=True, lowest=-LARGEST_ROW_MARGIN)
     families = [family for family in program.families if not family.defines and family.uncertain is not None]
     pairs = [(family, index) for family in families if family.start is not None for index in family.start]
     imposed_keys: set[tuple[str, bytes]] = set()

@@ -17,7 +17,16 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.verdict import worst_of
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Found, Ledger, Prover, Violated, above, witnesses
+from sparserob_core.sip.working.ledger import (
+    SEARCH_TOLERANCE,
+    CheckedAnswer,
+    Found,
+    Ledger,
+    Prover,
+    Violated,
+    above,
+    witnesses,
+)
 from sparserob_core.sip.working.working import LargestViolation, Working, left_open
 
 # Number of cells of a short proof. With a tenth, ordinary problems with parameters need a tightened decision although a
@@ -30,10 +39,10 @@ DUE = (0.4, 0.65, 0.85)  # shares of a limit after which a tightened decision is
 # Number of rounds, each as long as the longest so far, that must be left when a decision is tightened: one to tighten
 # and separate, one to prove, one to try again. With a third of them there is no time for a proof; with ten times as
 # many, nothing has been imposed by then.
-RESERVED = 3
+ROUNDS_LEFT = 3
 # First round after which a decision is tightened without a limit of time, and again after twice as many rounds, for a
 # user who interrupts. Ordinary problems end before; with ten times as many, a search of a minute leaves nothing proven.
-PATIENT = 8
+FIRST_TIGHTENED_ROUND = 8
 # Largest number of rounds of tightening. Each imposes violated constraints, or has at least twice the margin of the one
 # before. With a third of them, a constraint that is active on a hundred pieces is not yet imposed; ten times as many
 # are a search of their own.
@@ -45,11 +54,11 @@ SPARED = 1e-3
 # smaller margin needs too many cells. With a tenth of it, a constraint that is active between two imposed times takes
 # two rounds more, and one in four dimensions with a parameter more than twice the cells. With all of the cost, nothing
 # remains to choose at decisions far from feasible.
-DEAR = 0.1
+LARGE_CELLS_COST_SHARE = 0.1
 # Factor of the share that is tried next where the first margin is infeasible, as long as it is more than the tolerated
 # gap. With a tenth of it there is no second share; with ten times as much, four programs are solved in vain where every
 # margin is infeasible.
-THINNER = 0.01
+SMALLER_SHARE_FACTOR = 0.01
 # Factor of the larger margin that is tried next where it is infeasible. With a tenth of it, a margin is missing that
 # takes a tenth of the cells; with nine tenths of it, a program is solved for every tenth.
 NEARER = 0.25
@@ -134,7 +143,7 @@ def tighten_in_time(
     candidate = working.candidate(answer) if number & (number - 1) == 0 else None  # 1, 2, 4, 8, ...
     if candidate is not None and ledger.cheaper(candidate):
         x = candidate.solution.x
-        ledger.prove(candidate, separate(ledger.program, x, ledger.tools, ALLOWED), prover(x, GLANCE))
+        ledger.prove(candidate, separate(ledger.program, x, ledger.tools, SEARCH_TOLERANCE), prover(x, GLANCE))
     violations, violated = [LargestViolation.of(*pair) for pair in found], [above(*pair) for pair in found]
     is_near = working.due_count == 0
     if deadline.left is None:  # with nothing left to impose, the proof of this decision follows at once
@@ -142,12 +151,12 @@ def tighten_in_time(
     is_near = is_near and _is_near(working, ledger.program, answer, violations)
     if deadline.left is None:
         working.due_count += is_near
-        is_due = is_near or (number >= PATIENT and number & (number - 1) == 0)
+        is_due = is_near or (number >= FIRST_TIGHTENED_ROUND and number & (number - 1) == 0)
     else:
         is_due = is_near or (working.due_count < len(DUE) and deadline.used >= DUE[working.due_count])
         working.due_count += is_due
         longest = max(np.diff(round_times, prepend=0.0), default=0.0)
-        is_due = is_due or (ledger.proven is None and deadline.left <= RESERVED * longest)
+        is_due = is_due or (ledger.proven is None and deadline.left <= ROUNDS_LEFT * longest)
     if not is_due or _is_proven_cheaply(ledger):
         return False
     if not any(rows.size for _, rows, _ in violated):  # the answer may be proven as it is, which takes less time
@@ -221,8 +230,9 @@ def _tighten(
     of the cost pays for, plus twice the largest violation of the answer. Later margins add twice what the proof leaves
     open. An addition is temporary where new constraints were imposed for it, and is omitted where it makes the program
     infeasible. Where even the first margin makes it infeasible, a hundredth of ``spared`` is tried. Where only the
-    margin that large cells require makes it infeasible, smaller cells are used, with a margin that costs `DEAR` of the
-    cost or a part of it. Nothing is proven where every margin makes the program infeasible.
+    margin that large cells require makes it infeasible, smaller cells are used, with a margin that costs
+    `LARGE_CELLS_COST_SHARE` of the cost or a part of it. Nothing is proven where every margin makes the program
+    infeasible.
 
     Parameters
     ----------
@@ -256,7 +266,7 @@ def _tighten(
         addition = PAID * max((working.distance(violation) for violation in violations), default=0.0)
         margin = max(margin, working.margin + (spared * cost / price if price > 0.0 else 0.0))
         margin += 0.0 if fresh else addition
-        addition = addition if fresh and addition * price < DEAR * cost else 0.0
+        addition = addition if fresh and addition * price < LARGE_CELLS_COST_SHARE * cost else 0.0
         tighter = _solve_tightened(working, ledger, answer, margin, addition)
         if tighter is None and kept is not None:  # no margin as large cells require: smaller cells, a margin that costs
             if dear_margin * price <= PAID * spared * cost:
@@ -269,7 +279,7 @@ def _tighten(
             )
             continue
         if tighter is None:  # no such margin, for example where two constraints are close to each other
-            margin, spared, violations = working.margin, THINNER * spared, ()
+            margin, spared, violations = working.margin, SMALLER_SHARE_FACTOR * spared, ()
             if price > 0.0 and spared >= ledger.tolerance:
                 continue
             break
@@ -290,8 +300,9 @@ def _tighten(
 
 
 def _compute_dear_margin(cost: float, price: float) -> float:
-    """Return the margin that costs the share `DEAR` of a ``cost``; finite where the ``price`` is almost 0."""
-    return float(DEAR * cost / max(price, max(cost, 1.0) * np.finfo(float).tiny))
+    """Return the margin that costs the share `LARGE_CELLS_COST_SHARE` of a ``cost``; finite where the ``price`` is
+    almost 0."""
+    return float(LARGE_CELLS_COST_SHARE * cost / max(price, max(cost, 1.0) * np.finfo(float).tiny))
 
 
 def _solve_tightened(
@@ -311,9 +322,9 @@ def _solve_tightened(
 
 def _separate_violations(ledger: Ledger, x: Array) -> tuple[Found, Sequence[LargestViolation], Violated]:
     """Return the separations at ``x (n,)``, the largest violations among them, and the constraints to impose."""
-    separations = separate(ledger.program, x, ledger.tools, ALLOWED, max(1, len(ledger.history)))
+    separations = separate(ledger.program, x, ledger.tools, SEARCH_TOLERANCE, max(1, len(ledger.history)))
     violated_pairs = [
-        pair for pair in separations if not pair[0].defines and pair[1].violations.max(initial=0.0) > ALLOWED
+        pair for pair in separations if not pair[0].defines and pair[1].violations.max(initial=0.0) > SEARCH_TOLERANCE
     ]
     return (
         separations,

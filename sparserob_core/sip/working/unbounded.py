@@ -24,19 +24,21 @@ from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import rows_of
 from sparserob_core.sip.result import Result, Status
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.ledger import ALLOWED, Close, Ledger, Prover, Violated, above, unproven
+from sparserob_core.sip.working.ledger import SEARCH_TOLERANCE, Close, Ledger, Prover, Violated, above, unproven
 
 SPENT = 1e-12  # of a bound: what it loses for multipliers of rows without one; ten times less is lost in rounding
 NO_FALL = 1e-12  # of the largest coefficient: fall of the cost per unit of a direction that is certainly rounding
-ROUNDS = 200  # of collecting rows that bound a program; a fifth serve quadratic forms in three coordinates
+MAX_BOUNDING_ROUNDS = 200  # of collecting rows that bound a program; a fifth serve quadratic forms in three coordinates
 FALLS = 1e-7  # of the largest coefficient: fall of the cost per unit of a direction that is no rounding
 # Largest number of moving coordinates for which the first rows are on a grid: two points along each of ten coordinates
 # are a thousand indices.
-FEW = 8
-DENSE = 2  # first rows of a family for every variable: with one, polynomials take twice as long, with four filters do
+MAX_GRID_COORDINATES = 8
+# First rows of a family for every variable: with one, polynomials take twice as long, with four filters do
+ROWS_PER_VARIABLE = 2
 DENSER = 2  # points more along every coordinate: both parities are tried; ten more are many rows in four coordinates
-MANY = 300  # entries of a decision up to which its first rows are looked at: ten times as many take a minute
-SHOWN = 6  # largest number of entries of a ray in the message
+# Entries of a decision up to which its first rows are looked at: ten times as many take a minute
+MAX_SCANNED_ENTRIES = 300
+MAX_RAY_ENTRIES = 6  # largest number of entries of a ray in the message
 
 
 def recession_program(program: SemiInfiniteProgram) -> SemiInfiniteProgram:
@@ -87,16 +89,16 @@ def _has_bounds(program: SemiInfiniteProgram) -> bool:
 def first_rows(program: SemiInfiniteProgram) -> list[tuple[Array, np.ndarray, str]]:
     """Return rows that usually make an unbounded relaxed program bounded.
 
-    A family gets at least `DENSE` indices for every variable of the decision, and as many more, if at most `FEW`
-    coordinates of its index can move; otherwise it gets one index. They are dense at the faces of the index set, where
-    polynomials and cosines grow most (nodes of Chebyshev). Where such a grid happens to meet the zeros of a term, as
-    that of three angles does for a sine, it does not bound the decision, and one with more points is tried. Nothing is
-    returned where the decision has bounds.
+    A family gets at least `ROWS_PER_VARIABLE` indices for every variable of the decision, and as many more, if at most
+    `MAX_GRID_COORDINATES` coordinates of its index can move; otherwise it gets one index. They are dense at the faces
+    of the index set, where polynomials and cosines grow most (nodes of Chebyshev). Where such a grid happens to meet
+    the zeros of a term, as that of three angles does for a sine, it does not bound the decision, and one with more
+    points is tried. Nothing is returned where the decision has bounds.
     """
     if _has_bounds(program):
         return []
     first = _list_grid_rows(program, 0)
-    if program.n > MANY:
+    if program.n > MAX_SCANNED_ENTRIES:
         return first
     grids = (first, *(_list_grid_rows(program, more) for more in range(1, DENSER + 1)))
     return next((rows for rows in grids if _is_bounded_by(program, rows)), first)
@@ -108,7 +110,7 @@ def _list_grid_rows(program: SemiInfiniteProgram, more: int) -> list[tuple[Array
     for family in program.families:
         box = family.index_set
         free_axes = np.flatnonzero(box.upper > box.lower)
-        count = DENSE * (program.n + 1) if free_axes.size <= FEW else 1
+        count = ROWS_PER_VARIABLE * (program.n + 1) if free_axes.size <= MAX_GRID_COORDINATES else 1
         side = int(np.ceil(count ** (1.0 / max(1, free_axes.size)) - 1e-9)) + more * (count > 1)
         share = 0.5 - 0.5 * np.cos(np.pi * np.arange(side) / max(1, side - 1)) if side > 1 else np.array([0.5])
         lines = [share if i in free_axes else np.zeros(1) for i in range(box.dimension)]
@@ -187,7 +189,7 @@ def _collect_rows(
     if recession.finite.blocks is not None:
         return chosen, False
     rows = rows_of(recession, chosen)
-    for number in range(ROUNDS):
+    for number in range(MAX_BOUNDING_ROUNDS):
         tools.deadline.check()
         base, G = recession.finite, np.unique(rows.G, axis=0)  # rows that differ on the right alone are the same here
         corner = simplex(replace(base, G=np.vstack([base.G, G]), h=np.concatenate([base.h, np.zeros(len(G))])))
@@ -195,7 +197,9 @@ def _collect_rows(
             return chosen, False
         if recession.cost(corner.x) >= -fall:
             return chosen, True
-        violated = [above(*pair) for pair in separate(recession, corner.x, replace(tools, budget=0), ALLOWED, number)]
+        violated = [
+            above(*pair) for pair in separate(recession, corner.x, replace(tools, budget=0), SEARCH_TOLERANCE, number)
+        ]
         fresh = [entry for entry in violated if entry[1].size]
         if not fresh:
             return chosen, False
@@ -289,9 +293,9 @@ def falls_for_ever(ledger: Ledger, close: Close, prover: Prover, ray: Array) -> 
         return result
     cost = program.cost(result.decision)
     slope = float(program.finite.weights @ np.abs(program.finite.image(ray)) + program.finite.q @ ray)
-    order = np.argsort(-np.abs(ray), kind="stable")[:SHOWN]
+    order = np.argsort(-np.abs(ray), kind="stable")[:MAX_RAY_ENTRIES]
     terms = ", ".join(f"{ray[i]:.4g} in x{i + 1}" for i in np.sort(order))
-    dots = ", ..." if program.n > SHOWN else ""
+    dots = ", ..." if program.n > MAX_RAY_ENTRIES else ""
     is_proven = result.status in ("certified", "verified")
     met = (
         "the decision is proven to meet the constraints" if is_proven else "the decision meets them as far as was seen"

@@ -18,7 +18,7 @@ from sparserob_core.sip.evidence import Dual, Proof
 from sparserob_core.sip.program import EQUALITY, ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.result import SMALL_COST, Result
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Found, Ledger, Prover, Violated, above
+from sparserob_core.sip.working.ledger import SEARCH_TOLERANCE, CheckedAnswer, Found, Ledger, Prover, Violated, above
 
 # The least positive margin, and the largest, in units of the decision's bounds where those are below 1. The least is
 # the rounding of rows: five times as much costs most of the tolerated gap where multipliers are a million; less has no
@@ -27,13 +27,13 @@ from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Found, Led
 SMALLEST_MARGIN, LARGEST_MARGIN = 2.0**-52, 1e-6
 # Factor of the next margin after one that leaves nothing feasible. With a tenth as factor, a set as thin as 1e-8 takes
 # three times as many programs; with a millionth, the margin of such a set is below the residuals of solvers.
-THINNER = 1e-3
+SMALLER_MARGIN_FACTOR = 1e-3
 # Largest number of margins raised for the rounding of a proof. The first suffices nearly always; ten times as many are
 # full proofs of minutes that no margin lets succeed.
 ALLOWANCES = 4
 # Share of the tolerated gap that is paid for the errors of a proof, such as those of transition matrices over many
 # orbits. With all of it, nothing is left for the bounds; with a tenth, gaps stay open that a larger margin closes.
-AFFORDED = 0.5
+ROUNDING_SHARE_OF_GAP = 0.5
 # Number of active rows at which a margin may cost a quarter of the tolerated gap. With ten times as many, a long arc
 # along a constraint takes twice as many cells; with a tenth, costs of ordinary problems are a relative 2e-8 too high.
 MANY_ACTIVE = 32
@@ -285,7 +285,7 @@ class Working(ABC):
         ledger.improve(self.proven(ledger, answer, decision))
         if not fits(ledger, decision):
             return answer, found
-        all_separations = separate(self.program, decision, ledger.tools, ALLOWED, number)
+        all_separations = separate(self.program, decision, ledger.tools, SEARCH_TOLERANCE, number)
         separations = [pair for pair in all_separations if not pair[0].defines]
         if any(above(*pair)[1].size for pair in separations):
             return answer, found
@@ -299,7 +299,9 @@ class Working(ABC):
         """
         if self.margin <= 0.0:
             return False
-        self.ceiling = THINNER * self.margin if THINNER * self.margin >= SMALLEST_MARGIN else 0.0
+        self.ceiling = (
+            SMALLER_MARGIN_FACTOR * self.margin if SMALLER_MARGIN_FACTOR * self.margin >= SMALLEST_MARGIN else 0.0
+        )
         self.margin, self.slater = self.ceiling, self.ceiling > 0.0
         return True
 
@@ -327,7 +329,7 @@ class Working(ABC):
         violated = [
             violation
             for pair in found
-            if (violation := LargestViolation.of(*pair)).size > ALLOWED and self.knows(violation)
+            if (violation := LargestViolation.of(*pair)).size > SEARCH_TOLERANCE and self.knows(violation)
         ]
         if not violated or not self.slater or self.floor >= self.ceiling:
             return False
@@ -377,8 +379,9 @@ class Working(ABC):
         A margin without a price from multipliers is refused, for its cost is unknown.
         """
         price = self.priced(answer)
-        return self.ceiling >= LARGEST_MARGIN and 0.0 < price * margin <= AFFORDED * ledger.tolerance * size_of(
-            self.program, answer
+        return (
+            self.ceiling >= LARGEST_MARGIN
+            and 0.0 < price * margin <= ROUNDING_SHARE_OF_GAP * ledger.tolerance * size_of(self.program, answer)
         )
 
 
@@ -401,7 +404,7 @@ def at_rest(program: SemiInfiniteProgram, x: Array) -> Array:
 def fits(ledger: Ledger, x: Array) -> bool:
     """Return whether a decision closes the gap and satisfies all constraints that are no family."""
     base = ledger.program.finite
-    return not ledger.open(x) and base.equality_residual(x) <= EQUALITY and base.residual(x) <= ALLOWED
+    return not ledger.open(x) and base.equality_residual(x) <= EQUALITY and base.residual(x) <= SEARCH_TOLERANCE
 
 
 def size_of(program: SemiInfiniteProgram, answer: CheckedAnswer) -> float:

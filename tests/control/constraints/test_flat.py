@@ -153,7 +153,7 @@ def test_among_many_pieces_the_worst_violation_is_the_same_and_the_others_are_me
     for lowered in (0.0, height, height + 1.0):  # violated, touched, met
         moved = replace(constraint, h=constraint.h + lowered)
         few = moved.worst(x)
-        monkeypatch.setattr(flat, "MANY", 1)
+        monkeypatch.setattr(flat, "SAMPLED_ONLY_PIECES", 1)
         many = replace(moved, shared=None).worst(x)
         monkeypatch.undo()
         assert many.violations[0] == pytest.approx(few.violations[0], abs=1e-12)

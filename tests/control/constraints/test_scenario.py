@@ -26,11 +26,11 @@ def flat(system, bound=None, start=0.0, stop=2.0):
     return FlatConstraint("wall", functionals, SIDES, LIMITS, start, stop, ParameterIndex(system.parameters))
 
 
-@pytest.mark.parametrize("block", [1, 3, scenario.BLOCK])
+@pytest.mark.parametrize("block", [1, 3, scenario.MAX_VIOLATIONS_PER_BLOCK])
 def test_the_worst_of_sampled_disturbances_is_by_hand(block, monkeypatch):
     """``x' = u + w`` from 1: 1.5 + 0.2 at 1 and 1.25 + 0.5 at 2 under the second;
     the least is 1.25 - 0.6 under the third."""
-    monkeypatch.setattr(scenario, "BLOCK", block)
+    monkeypatch.setattr(scenario, "MAX_VIOLATIONS_PER_BLOCK", block)
     base = flat(LinearSystem(np.zeros((1, 1)), ONE, E=ONE), Box([-0.5], [0.5]))
     samples = np.array([[[0.0, 0.0]], [[0.2, 0.3]], [[-0.1, -0.5]]])
     made = ScenarioConstraint(base, SIDES, LIMITS, samples, np.zeros((3, 0)))
@@ -69,10 +69,10 @@ def test_what_samples_ask_for_is_told_by_names_in_the_units_of_the_problem(secon
     assert f"terminal: height({second:g}) <= 0.2 m (sample " in result.message
 
 
-@pytest.mark.parametrize("block", [1, 7, scenario.BLOCK])
+@pytest.mark.parametrize("block", [1, 7, scenario.MAX_VIOLATIONS_PER_BLOCK])
 def test_the_worst_of_sampled_parameters_is_by_hand(block, monkeypatch):
     """``x' = p x``: ``e^(2 p)`` at the end."""
-    monkeypatch.setattr(scenario, "BLOCK", block)
+    monkeypatch.setattr(scenario, "MAX_VIOLATIONS_PER_BLOCK", block)
     system = LinearSystem(parse_matrix("A", [["p1"]], ("p1",)), ONE, parameters=Box([-0.5], [0.5]))
     made = ScenarioConstraint(flat(system), SIDES, LIMITS, None, np.array([[0.1], [0.3], [-0.2], [0.25]]))
     found = made.worst(np.zeros(2))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.loop.tracking import KEPT, PARTS, SHARP, Tracking, trackable
+from sparserob_core.control.loop.tracking import KEPT, MIN_LEVEL, PARTS, Tracking, trackable
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.transcription.transcribe import from_state, in_own_units, prepare
 from sparserob_core.sip.program import TOLERANCE
@@ -79,13 +79,13 @@ def test_new_rows_lie_at_the_peaks_of_what_is_violated() -> None:
     tracking, state = Tracking(own), np.array([-1, 1]) / units.states
     best, moved, seen = tracking.solve(state).decision, from_state(own, state), 0
     for share in (1e-6, 1e-4, 0.1):
-        x, finest = (1.0 - share) * best, PARTS**SHARP
+        x, finest = (1.0 - share) * best, PARTS**MIN_LEVEL
         open_ = tracking._find_unproven_instants(x, *tracking._propagate_uncontrolled(state))
         assert open_
         for row, piece, level, number in open_:
             if piece == tracking.stop[row] == tracking.start[row]:
                 continue  # a time alone
-            assert level == SHARP
+            assert level == MIN_LEVEL
             seen += 1
             begin, end = tracking.start[row] * tracking.length, tracking.stop[row] * tracking.length
             times = np.clip((piece + (number + np.array([-1, 0, 1])) / finest) * tracking.length, begin, end)

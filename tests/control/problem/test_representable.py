@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.problem.representable import LARGEST, require_representable
+from sparserob_core.control.problem.representable import LARGEST_NUMBER, require_representable
 
 CONFIG = """problem:
   name: linear
@@ -55,7 +55,7 @@ def problem(A: Any = ((0.0, 1.0), (0.0, 0.0)), horizon: float = 1.0, **rest: Any
 
 @pytest.mark.parametrize("growth", [0.999, 1.001])
 def test_growth_is_refused_from_the_largest_number_on(growth: float) -> None:
-    rate = growth * np.log(LARGEST) / 2.0
+    rate = growth * np.log(LARGEST_NUMBER) / 2.0
     grows = problem(np.diag([rate, -rate]), 2.0)
     if growth < 1.0:
         require_representable(grows)
@@ -66,7 +66,7 @@ def test_growth_is_refused_from_the_largest_number_on(growth: float) -> None:
 
 @pytest.mark.parametrize("size", [0.999, 1.001])
 def test_numbers_of_every_kind_are_refused_from_the_largest_on(size: float) -> None:
-    large = size * LARGEST
+    large = size * LARGEST_NUMBER
     scaled = sr.Polytope([[large, 0.0]], [1.0])
     given = {
         ("system", "parameters"): lambda: problem(
@@ -91,7 +91,9 @@ def test_what_is_free_is_no_large_number() -> None:
 
 
 def test_the_values_of_functions_count() -> None:
-    large = problem(lambda p: np.array([[0.0, 10.0 * LARGEST * p[0]], [0.0, 0.0]]), parameters=sr.Box([0.0], [1.0]))
+    large = problem(
+        lambda p: np.array([[0.0, 10.0 * LARGEST_NUMBER * p[0]], [0.0, 0.0]]), parameters=sr.Box([0.0], [1.0])
+    )
     with pytest.raises(sr.InputError, match=r"system\.A"):
         require_representable(large)
 
@@ -121,7 +123,7 @@ def test_the_values_of_functions_count() -> None:
     ],
 )  # fmt: skip
 def test_a_large_number_of_a_plant_has_the_key_of_a_config(build: Any, path: str) -> None:
-    large = 10.0 * LARGEST
+    large = 10.0 * LARGEST_NUMBER
     system = build(large)
     made = sr.OptimalControlProblem(
         system=system,

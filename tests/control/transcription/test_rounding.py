@@ -95,7 +95,7 @@ def test_what_errors_of_execution_bring_to_a_row_is_added_up_too() -> None:
     result = SimpleNamespace(dual=SimpleNamespace(cuts=[Cut("terminal", np.array([2.0]), 1, 1.0)], mu=np.zeros(0)))
     # the beginning, 1, and what a command of 3 and 5 % of it, as often as integrals count, bring in 2 units of time
     total = 1.0 + 6.0 + 0.3 * rounding.INTEGRATED
-    assert rounding._sum_row_magnitudes(model, result, rounding.SHARE, None) == pytest.approx(total)  # type: ignore[arg-type]
+    assert rounding._sum_row_magnitudes(model, result, rounding.ROW_ROUNDING, None) == pytest.approx(total)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_a_piece_whose_push_is_clear_of_its_price_adds_nothing(multiplier: float
     )
     # the beginning, 1, and what a command of 3 brings in 2 units of time, at a price of 1
     prices = model.program.finite.weights
-    found = rounding._sum_row_magnitudes(model, result, rounding.SHARE, prices)  # type: ignore[arg-type]
+    found = rounding._sum_row_magnitudes(model, result, rounding.ROW_ROUNDING, prices)  # type: ignore[arg-type]
     assert found == pytest.approx(multiplier * (1.0 + counted), rel=1e-12)
 
 

@@ -15,7 +15,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.terms.windows import PathConstraint
 from sparserob_core.control.sets.sets import Ellipsoid, Equality, NormBall, Polytope
-from sparserob_core.control.transcription.own_units import THIN, units_of_sides
+from sparserob_core.control.transcription.own_units import THIN_SET_SHARE, units_of_sides
 from sparserob_core.control.transcription.transcribe import transcribe
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Box
@@ -264,7 +264,7 @@ def test_a_slab_that_is_thin_beside_what_a_plant_amplifies_is_one_like_others() 
 def test_the_unit_of_a_slab_that_doubles_do_not_resolve_is_how_far_its_row_reaches() -> None:
     """2^-37 of the sums, less than what the checker calls thin; a sixteenth of the reach, since a claim may excuse no
     more than what the row does. A unit is 1.2 to 2.5 times below that."""
-    assert THIN < checked.THIN
+    assert THIN_SET_SHARE < checked.THIN
     H, added = np.array([[1.0], [-1.0]]), np.full(2, 4.0)
     for share, unit in ((0.99, 2.0**-4 * 3.0), (1.01, 2.0**-18 * 4.0)):
         half = 0.5 * share * 2.0**-37 * 4.0

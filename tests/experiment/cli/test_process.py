@@ -279,7 +279,7 @@ observers: []
 
 @pytest.mark.slow
 def test_a_limit_ends_a_transcription_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparserob_core.sip.limits.deadline.GRACE", 0.0)
+    monkeypatch.setattr("sparserob_core.sip.limits.deadline.LIMIT_GRACE_SECONDS", 0.0)
     (tmp_path / "large.yaml").write_text(LARGE)
     outcome = sr.run(tmp_path / "large.yaml", out=tmp_path / "run")
     assert (outcome.status, outcome.result.lower_bound, outcome.control) == ("undecided", 0.0, None)

@@ -175,14 +175,14 @@ def test_a_file_that_pretends_to_hold_much_is_refused_unread(tmp_path: Path, mon
         archive.writestr("A.npy", head.getvalue())
     with pytest.raises(sr.ConfigError):
         load_config(config)
-    monkeypatch.setattr(files, "LARGEST", 100)
+    monkeypatch.setattr(files, "MAX_MATRIX_FILE_BYTES", 100)
     np.savez_compressed(tmp_path / "given" / "plant.npz", A=np.zeros((50, 50)))
     with pytest.raises(sr.ConfigError, match="at most 100 bytes"):
         load_config(config)
 
 
 def test_matrices_that_no_directory_could_hold_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "MAX_TEXT", 10)
+    monkeypatch.setattr(files, "MAX_PACKED_LETTERS", 10)
     with pytest.raises(sr.ConfigError, match="at most 10 characters"):
         load_config(beside(tmp_path / "given", **good()))
 

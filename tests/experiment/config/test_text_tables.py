@@ -74,9 +74,9 @@ def test_a_file_at_fault_is_refused_with_its_line(fault: str, tmp_path: Path) ->
 
 def test_a_file_that_is_too_large_is_refused_unread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "t.csv").write_text("1\n2\n")
-    monkeypatch.setattr(text_tables, "LARGEST", 4)
+    monkeypatch.setattr(text_tables, "MAX_TABLE_BYTES", 4)
     assert read_table(tmp_path / "t.csv").column == [1.0, 2.0]
-    monkeypatch.setattr(text_tables, "LARGEST", 3)
+    monkeypatch.setattr(text_tables, "MAX_TABLE_BYTES", 3)
     with pytest.raises(InputError, match="at most 3 bytes"):
         read_table(tmp_path / "t.csv")
 

@@ -220,7 +220,7 @@ def test_a_small_file_that_pretends_to_hold_a_huge_array_is_refused(
         archive.writestr("x.npy", np.lib.format.magic(1, 0) + len(header).to_bytes(2, "little") + header)
     with pytest.raises(sr.InputError, match=r"x\.npz: cannot be read: expected arrays"):
         read_arrays(file)
-    monkeypatch.setattr("sparserob_core.experiment.config.matrices.arrays.LARGEST", 1000)
+    monkeypatch.setattr("sparserob_core.experiment.config.matrices.arrays.MAX_ARRAY_BYTES", 1000)
     np.savez_compressed(file, x=np.zeros(1000))
     assert file.stat().st_size < 1000
     with pytest.raises(sr.InputError, match="expected arrays of at most"):

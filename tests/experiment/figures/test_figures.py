@@ -217,7 +217,7 @@ def test_of_very_many_states_no_more_is_computed_than_is_drawn(policy: str, monk
     data = drawing.figure_data(experiment, decision, None, (), None, states=shown)
     assert data.drawn_states == tuple(shown) and data.of_states == f", {MAX_STATES} of {n} states"
     assert np.isnan(data.tube_lower[MAX_STATES:]).all()
-    assert asked[0] == drawing.ROUGH * n and max(asked[1:]) == MAX_STATES * data.times.size
+    assert asked[0] == drawing.SAMPLED_TIMES * n and max(asked[1:]) == MAX_STATES * data.times.size
     known = result.tube(data.times)
     np.testing.assert_allclose(data.tube_upper[list(shown)], known.upper[list(shown)], rtol=1e-12)
     np.testing.assert_allclose(data.state[list(shown)], known.nominal[list(shown)], rtol=1e-12)

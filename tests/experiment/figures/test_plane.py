@@ -12,7 +12,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.control.studies.answer import supports
 from sparserob_core.experiment.figures.active import Active
-from sparserob_core.experiment.figures.drawing import CORNERS, figure_data
+from sparserob_core.experiment.figures.drawing import POLYGON_CORNERS, figure_data
 from sparserob_core.experiment.figures.plane import Limit, Plane, clipped
 from sparserob_core.experiment.figures.style import ORANGE
 from sparserob_core.experiment.run.drawing import switching
@@ -62,7 +62,7 @@ def drawn(result: sr.SolvedProblem) -> Any:
 def test_places_touch_the_worst_case_in_every_direction_and_nothing_reaches_beyond(solved: sr.SolvedProblem) -> None:
     data = drawn(solved)
     places, angles = data.plane.places, np.linspace(0.0, 2.0 * np.pi, 97)
-    assert places.shape == (data.times.size, CORNERS, 2)
+    assert places.shape == (data.times.size, POLYGON_CORNERS, 2)
     directions = np.zeros((97, 4))
     directions[:, :2] = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     reached = supports(solved.model, np.ravel(solved.decision), data.times, directions)

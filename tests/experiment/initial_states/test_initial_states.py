@@ -301,6 +301,8 @@ def test_an_interrupt_before_the_box_fits_returns_what_is_known(programs, known,
 
 
 def test_a_limit_of_time_ends_the_search_with_what_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparserob_core.sip.limits.deadline.GRACE", 60.0)  # the transcription is let finish
+    monkeypatch.setattr(
+        "sparserob_core.sip.limits.deadline.LIMIT_GRACE_SECONDS", 60.0
+    )  # the transcription is let finish
     found = sr.initial_states(CART, {"limits.seconds": 1e-3}, directions=4, values=0)
     assert found.status == "undecided" and "the limit of 0.001 s is reached" in found.message

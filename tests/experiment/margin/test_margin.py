@@ -274,7 +274,9 @@ def test_the_command_ends_with_the_status_of_what_it_found(command, tmp_path):
 
 
 def test_a_limit_ends_a_margin_with_what_is_proven_by_then(monkeypatch):
-    monkeypatch.setattr("sparserob_core.sip.limits.deadline.GRACE", 60.0)  # the transcription is let finish
+    monkeypatch.setattr(
+        "sparserob_core.sip.limits.deadline.LIMIT_GRACE_SECONDS", 60.0
+    )  # the transcription is let finish
     config = Path(__file__).resolve().parents[3] / "configs" / "experiment1_repaired.yaml"
     found = sr.margin(config, "disturbance", {"observers": [], "limits.seconds": 0.01})
     assert found.status == "undecided"

@@ -18,7 +18,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.sip.limits import apart
 from sparserob_core.sip.limits.apart import call_apart
-from sparserob_core.sip.limits.deadline import GRACE, LAST, Deadline, OutOfTime
+from sparserob_core.sip.limits.deadline import LAST_STEP_SECONDS, LIMIT_GRACE_SECONDS, Deadline, OutOfTime
 
 LATE = 2.0  # seconds by which a limit may be missed, of the processor: other processes take their share of the wall's
 FORKS = pytest.mark.skipif(not apart.POSSIBLE, reason="there is no fork here")
@@ -160,7 +160,7 @@ def test_a_deadline_is_enforced_in_every_thread_and_again_where_it_was_not_heede
                             raise
         except OutOfTime as error:
             errors.append(error)
-        time.sleep(2 * LAST)  # nothing rings any more
+        time.sleep(2 * LAST_STEP_SECONDS)  # nothing rings any more
 
     if where == "main":
         work()
@@ -169,7 +169,7 @@ def test_a_deadline_is_enforced_in_every_thread_and_again_where_it_was_not_heede
         thread.start()
         thread.join(20.0)
     assert len(rung) == 2
-    assert rung[0] >= GRACE
+    assert rung[0] >= LIMIT_GRACE_SECONDS
     assert [str(error) for error in errors] == ["the limit of 0.05 s is reached"]
 
 

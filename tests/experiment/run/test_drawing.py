@@ -45,7 +45,7 @@ def searched(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """No time but for the coarsest landscape."""
-    monkeypatch.setattr(drawing, "SECONDS", 0.0)
+    monkeypatch.setattr(drawing, "LANDSCAPE_VALUE_SECONDS", 0.0)
 
 
 @pytest.mark.slow
@@ -168,7 +168,7 @@ def test_the_rows_of_an_index_are_built_once_while_there_is_room(monkeypatch: py
             assert np.array_equal(got, wanted)
         del built[-len(indices) :]
     assert set(built) == {0.5, 0.25, 0.75} and built.count(0.5) == built.count(0.25) == 1
-    monkeypatch.setattr(inspection, "KEPT", 6)  # two rows of three numbers
+    monkeypatch.setattr(inspection, "MAX_ROW_NUMBERS_KEPT", 6)  # two rows of three numbers
     kept = inspection._remember_rows(family)
     built.clear()
     for index in (0.1, 0.2, 0.3, 0.1):

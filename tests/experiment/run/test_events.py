@@ -312,7 +312,7 @@ def test_the_moves_are_those_of_the_walk() -> None:
     for pause in (1e9, 0.0):  # one batch, or one for each evaluation
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("sparserob_core.sip.search.notifier.SECONDS_BETWEEN_EVENTS", pause)
-            patch.setattr("sparserob_core.sip.search.notifier.EVENTS", 1)
+            patch.setattr("sparserob_core.sip.search.notifier.MIN_EVENTS", 1)
             sr.maximise(lambda x: x[:, 0], SQUARE, Walking(), budget=13, notify=heard.append, polish=0.0)
     assert [event.count for event in heard] == [13] + [1] * 13
     together = [tuple(row) for row in heard[0].batch.moves.tolist()]

@@ -203,7 +203,7 @@ def test_what_can_never_be_certified_is_said_before_anything_is_solved(
     assert "the search for a witness" not in caplog.text
     assert "no control of this problem can be certified" in caplog.text
     assert "piecewise_constant" in caplog.text
-    monkeypatch.setattr(provable, "SECONDS", 1e-3)
+    monkeypatch.setattr(provable, "UNPROVABLE_SECONDS", 1e-3)
     result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4})
     assert result.stopped == "the limit of 0.001 s is reached"
     assert "the search for a witness ends after 0.001 s" in caplog.text

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 import sparserob_core as sr
 from sparserob_core.experiment.cli.main import _run_command_line, commands
 from sparserob_core.experiment.scaffold import new_plugin as module
-from sparserob_core.experiment.scaffold.new_plugin import LONGEST, RULES, kinds, new_plugin
+from sparserob_core.experiment.scaffold.new_plugin import MAX_NAME_LETTERS, RULES, kinds, new_plugin
 from tests.support.places import ROOT
 
 KINDS = kinds()
@@ -60,7 +60,7 @@ def test_a_package_has_what_an_author_needs(kind, tmp_path):
 
 def test_packages_are_as_clean_as_this_one_whatever_the_length_of_their_names(tmp_path):
     for kind in KINDS:
-        for name in ("z", "trial", "q" * LONGEST, kind):
+        for name in ("z", "trial", "q" * MAX_NAME_LETTERS, kind):
             if kind in RULES or name not in sr.load_registry().names(kind):
                 new_plugin(kind, name if name != kind else f"my_{kind}", tmp_path / f"{kind}_{name}")
     run(["-m", "ruff", "check", "--no-cache", "."], tmp_path)
@@ -84,7 +84,7 @@ def test_a_package_passes_its_tests_as_it_is_written(tmp_path):
         ("solver", "", "name: expected lower-case letters"),
         ("solver", "a__b", "name: expected lower-case letters"),
         ("solver", "../mine", "name: expected lower-case letters"),
-        ("solver", "q" * (LONGEST + 1), f"at most {LONGEST} of them"),
+        ("solver", "q" * (MAX_NAME_LETTERS + 1), f"at most {MAX_NAME_LETTERS} of them"),
         ("solver", "piqp", r"name: expected a name that no solver has, got 'piqp', which is solver 'piqp' \(plugin"),
         ("method", "exchange", "name: expected a name that no method has"),
         ("observer", "piqp", "name: expected a name that no plugin has, got 'piqp'"),

@@ -210,7 +210,7 @@ def test_extreme_points_of_a_box_are_its_corners():
 @pytest.mark.parametrize("numbers", [2_000_000, 0])
 def test_trajectories_agree_with_an_integrator_and_with_augmented_exponentials(numbers, monkeypatch):
     """With as many numbers as are held of transitions, and, where none are, by modes."""
-    monkeypatch.setattr("sparserob_core.control.studies.simulate.HELD", numbers)
+    monkeypatch.setattr("sparserob_core.control.studies.simulate.MAX_NUMBERS_AT_ONCE", numbers)
     rng = np.random.default_rng(7)
     for states, pieces in ((2, 5), (3, 4)):
         system = random_system(rng, states, 2, 2)

@@ -408,7 +408,9 @@ def test_a_point_at_a_time_limit_is_run_again_and_a_finished_one_is_not(counting
 
 @pytest.mark.slow
 def test_an_answer_at_a_time_limit_is_a_row_and_is_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparserob_core.sip.limits.deadline.GRACE", 60.0)  # the transcription is let finish
+    monkeypatch.setattr(
+        "sparserob_core.sip.limits.deadline.LIMIT_GRACE_SECONDS", 60.0
+    )  # the transcription is let finish
     file = tmp_path / "real.yaml"
     file.write_text(CONFIG.replace("method: {name: stub}\nplugins: [./stub.py]\n", ""))
     first = sr.sweep(file, {"dictionaries.control.pieces": [10, 12]}, {"limits.seconds": 1e-6}, out=tmp_path / "out")
@@ -720,7 +722,7 @@ def test_on_a_terminal_the_last_rows_are_shown_and_disappear(monkeypatch: pytest
 
     written = Terminal()
     monkeypatch.setattr(sys, "stderr", written)
-    monkeypatch.setattr(live_table, "RENEWED", 0.0)
+    monkeypatch.setattr(live_table, "SECONDS_PER_LOOK", 0.0)
     monkeypatch.setenv("TERM", "xterm")
     with live_table.LiveTable() as live:
         for number in range(30):

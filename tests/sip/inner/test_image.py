@@ -9,7 +9,7 @@ from scipy.sparse import csc_array, eye_array, vstack
 
 from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.inner.duality import dual_bound
-from sparserob_core.sip.inner.image import CANCELLED, onto_stationary, within_bounds
+from sparserob_core.sip.inner.image import CANCELLED_SHARE, onto_stationary, within_bounds
 
 
 def program(lower: list[float], upper: list[float], S: list[list[float]]) -> FiniteProgram:
@@ -53,7 +53,7 @@ def test_a_multiplier_near_its_limit_is_held_there_and_the_others_make_up_for_it
     z = np.concatenate([rng.normal(size=12), dust * np.abs(rng.normal(size=15))])
     moved = onto_stationary(program, z, program.q)
     assert np.abs(program.S.T @ moved + program.q).max() <= 1e-12
-    limit = CANCELLED * np.abs(moved).max()
+    limit = CANCELLED_SHARE * np.abs(moved).max()
     assert moved[12:].min() >= -limit  # below it a side without a lower bound proves nothing
     assert np.isfinite(dual_bound(program, np.zeros(0), np.zeros(0), z))
 
@@ -65,7 +65,7 @@ def test_what_is_stationary_already_but_beyond_its_limit_is_moved_too(seed):
     z[:12] = -(program.q + program.S[12:].T @ z[12:])
     moved = onto_stationary(program, z, program.q)
     assert np.abs(program.S.T @ moved + program.q).max() <= 1e-12
-    assert moved[12:].min() >= -CANCELLED * np.abs(moved).max()
+    assert moved[12:].min() >= -CANCELLED_SHARE * np.abs(moved).max()
 
 
 @pytest.mark.parametrize("off", [1e-14, 1e-13, 5e-13])

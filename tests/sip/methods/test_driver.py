@@ -83,7 +83,7 @@ def test_what_is_known_is_the_answer_where_the_time_is_over(when: str) -> None:
 
 
 def test_a_library_that_makes_another_error_of_the_alarm_ends_the_run_like_the_alarm(monkeypatch: Any) -> None:
-    monkeypatch.setattr(limits, "GRACE", 0.0)
+    monkeypatch.setattr(limits, "LIMIT_GRACE_SECONDS", 0.0)
 
     def step(number: int) -> Result:
         try:

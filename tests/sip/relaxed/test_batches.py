@@ -16,7 +16,7 @@ from sparserob_core.experiment.config.load import load_config
 from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.relaxed import batches
-from sparserob_core.sip.relaxed.batches import CHUNK, LONG, Batches, Oracle
+from sparserob_core.sip.relaxed.batches import CHUNK_TUPLES, MIN_CHUNKED_TUPLES, Batches, Oracle
 
 CONFIG = {
     "problem": {
@@ -54,7 +54,7 @@ class Elsewhere(Executor):
 @pytest.fixture
 def worth(monkeypatch):
     """Workers are asked however little there is to do."""
-    monkeypatch.setattr(batches, "WORTH", 0.0)
+    monkeypatch.setattr(batches, "MIN_SECONDS_FOR_WORKERS", 0.0)
     monkeypatch.setattr(batches, "START", 0.0)
 
 
@@ -132,7 +132,9 @@ def valued(oracle, points, executor=None):
 
 def test_values_do_not_depend_on_how_often_the_batch_was_asked_for(oracle):
     g = oracle.build()
-    points = np.random.default_rng(1).uniform(g.domain.lower, g.domain.upper, (LONG + 5, g.domain.dimension))
+    points = np.random.default_rng(1).uniform(
+        g.domain.lower, g.domain.upper, (MIN_CHUNKED_TUPLES + 5, g.domain.dimension)
+    )
     g.epsilon = 1e-2
     batch = Batches(g, oracle, None, 0)
     first, second = (batch.values(points, lambda value, dual: None) for _ in range(2))
@@ -140,17 +142,17 @@ def test_values_do_not_depend_on_how_often_the_batch_was_asked_for(oracle):
 
 
 def test_chunks_agree_with_one_after_the_other_to_the_accuracy_of_the_solver(oracle):
-    _, found, told = valued(oracle, points_of(oracle, LONG + 3))
+    _, found, told = valued(oracle, points_of(oracle, MIN_CHUNKED_TUPLES + 3))
     singly = oracle.build()
     singly.epsilon = 1e-2
-    np.testing.assert_allclose(found, singly(points_of(oracle, LONG + 3)), atol=1e-8)
+    np.testing.assert_allclose(found, singly(points_of(oracle, MIN_CHUNKED_TUPLES + 3)), atol=1e-8)
     assert [value for value, _ in told] == found.tolist()
     best = np.maximum.accumulate(found)
     assert [bounded for _, bounded in told] == [k == 0 or found[k] > best[k - 1] for k in range(len(found))]
 
 
 def test_who_asks_about_the_last_tuple_is_answered_about_it(oracle):
-    points = points_of(oracle, LONG)
+    points = points_of(oracle, MIN_CHUNKED_TUPLES)
     g, _, _ = valued(oracle, points)
     alone = oracle.build()
     alone.epsilon = 1e-2
@@ -167,7 +169,7 @@ def points_of(oracle, count):
 def test_a_deadline_on_a_worker_is_one_here(oracle, worth):
     g = oracle.build()
     g.epsilon = 1e-2
-    points = points_of(oracle, 2 * LONG)
+    points = points_of(oracle, 2 * MIN_CHUNKED_TUPLES)
 
     class Late(Elsewhere):
         def submit(self, fn, oracle, points, epsilon, best, seconds):
@@ -180,7 +182,7 @@ def test_a_deadline_on_a_worker_is_one_here(oracle, worth):
 
 
 def test_threads_of_a_worker_do_not_share_what_changes(oracle, worth):
-    points = points_of(oracle, 4 * LONG)
+    points = points_of(oracle, 4 * MIN_CHUNKED_TUPLES)
     _, expected, _ = valued(oracle, points)
     with ThreadPoolExecutor(3) as executor:
         _, found, _ = valued(oracle, points, executor)
@@ -188,7 +190,7 @@ def test_threads_of_a_worker_do_not_share_what_changes(oracle, worth):
 
 
 def test_chunks_are_shorter_than_long_batches():
-    assert CHUNK < LONG
+    assert CHUNK_TUPLES < MIN_CHUNKED_TUPLES
 
 
 @pytest.mark.slow

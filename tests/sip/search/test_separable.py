@@ -11,7 +11,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.sip.search.local_search import polish
 from sparserob_core.sip.search.search import CountedObjective, Target
-from sparserob_core.sip.search.separable import KNOTS, POINTS, separable_maxima
+from sparserob_core.sip.search.separable import KNOTS, POINTS_PER_UNKNOWN, separable_maxima
 
 HIGHEST = np.array([0.9, 0.15, 0.65])
 
@@ -43,7 +43,7 @@ def test_units_of_the_values_change_nothing(unit):
 
 
 def test_there_is_no_fit_of_too_few_points_of_one_coordinate_or_of_a_constant():
-    few = uniform(int(POINTS * 3 * KNOTS[-1]) - 1)
+    few = uniform(int(POINTS_PER_UNKNOWN * 3 * KNOTS[-1]) - 1)
     assert not list(separable_maxima(few, hills(few)))
     assert not list(separable_maxima(uniform(500, 1), uniform(500, 1)[:, 0]))
     assert not list(separable_maxima(uniform(500), np.ones(500)))

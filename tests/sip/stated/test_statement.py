@@ -154,7 +154,7 @@ def test_least_squares_do_not_square_a_condition(condition: float, noise: float,
 
 
 def test_a_decision_of_too_many_terms_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(statement, "MAX_ENTRIES", 20)
+    monkeypatch.setattr(statement, "MAX_STATED_ENTRIES", 20)
     with pytest.raises(InputError, match="minimise: expected at most 20 terms, got 30"):
         state({"a": 2}, "sum((a[0] - k - 1)**2 for k in range(30))", "a[0] >= t").build()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.sip.working.tightening import DEAR, _compute_dear_margin
+from sparserob_core.sip.working.tightening import LARGE_CELLS_COST_SHARE, _compute_dear_margin
 
 
 @pytest.mark.parametrize("pieces", [50, 250])
@@ -30,4 +30,4 @@ def test_a_distance_that_costs_next_to_nothing_is_a_number() -> None:
     for price in (0.0, 5e-324, np.finfo(float).tiny):
         for cost in (1e-3, 100.0, 1e12):
             assert np.isfinite(_compute_dear_margin(np.float64(cost), np.float64(price)))
-    assert _compute_dear_margin(2.0, 0.5) == DEAR * 4.0
+    assert _compute_dear_margin(2.0, 0.5) == LARGE_CELLS_COST_SHARE * 4.0

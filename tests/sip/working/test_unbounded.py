@@ -35,7 +35,7 @@ def test_the_first_rows_are_twice_as_many_as_the_variables_in_every_family():
     ]
     line, plane, point = unbounded.first_rows(sr.SemiInfiniteProgram(n=7, families=families))
     assert [name for _, _, name in (line, plane, point)] == ["line", "plane", "point"]
-    assert len(np.unique(line[0])) == unbounded.DENSE * 8
+    assert len(np.unique(line[0])) == unbounded.ROWS_PER_VARIABLE * 8
     assert {-1.0, 3.0} <= set(line[0][:, 0])
     assert len(np.unique(plane[0], axis=0)) == 16
     assert (plane[0][:, 1] == 5.0).all()

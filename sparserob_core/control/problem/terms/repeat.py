@@ -13,7 +13,7 @@ from sparserob_core.control.sets.sets import Equality
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
-SAME = 1e-12  # relative to the size of a set, the rounding error of its numbers
+SET_ROUNDING = 1e-12  # relative to the size of a set, the rounding error of its numbers
 RETURN = "return"  # the name of the constraint `Return` in messages, tables and figures
 # The share of the set of initial states by which final states stay inside of it. It is ten times the tolerance of a
 # proof, so that no period hands a violation on to the next: a tenth of it would, and ten times as much shows in the
@@ -105,7 +105,7 @@ def _free_flat_coordinates(bound: ConvexSet) -> ConvexSet:
     flat = bound.halfspaces()
     if flat is not None:
         room = flat[1] - flat[0] @ bound.interior_point()
-        if (room <= SAME * np.abs(flat[0]).max(axis=1) * float(bound.reach(axes).max())).any():
+        if (room <= SET_ROUNDING * np.abs(flat[0]).max(axis=1) * float(bound.reach(axes).max())).any():
             raise InputError(
                 path="repeat",
                 expected="a set of initial states with an interior, or a box",

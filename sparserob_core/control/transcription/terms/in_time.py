@@ -16,7 +16,8 @@ from sparserob_core.control.response.varying.spread import law_of
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array
 
-CORNERS = 64  # of a box of parameters: rows are as many times more, with ten times as many it would take minutes
+# Of a box of parameters: rows are as many times more, with ten times as many it would take minutes
+MAX_BOX_CORNERS = 64
 _CACHE: WeakKeyDictionary[OptimalControlProblem, OptimalControlProblem] = WeakKeyDictionary()
 
 
@@ -64,11 +65,11 @@ def within_reach(problem: OptimalControlProblem) -> OptimalControlProblem | str:
 
 def corners_of_box(depends: Dependence) -> list[Array]:
     """Return the corners of the box of parameters as shares of their deviation from its middle; only parameters that
-    reach a state vary. Raise `InputError` where there are more than `CORNERS`."""
+    reach a state vary. Raise `InputError` where there are more than `MAX_BOX_CORNERS`."""
     moves = depends.affected.any(axis=1) & (depends.units > 0.0)
     count = 2 ** int(moves.sum())
-    if count > CORNERS:
-        expected = f"a box with at most {CORNERS} corners beside the time t"
+    if count > MAX_BOX_CORNERS:
+        expected = f"a box with at most {MAX_BOX_CORNERS} corners beside the time t"
         raise InputError(path="system.parameters", expected=expected, got=f"{count}")
     return [
         np.array(corner) for corner in every_choice(*((-1.0, 1.0) if varies else (0.0,) for varies in moves.tolist()))

@@ -62,12 +62,12 @@ def compare(
     from sparserob_core.experiment.comparison.compare import compare as side_by_side
     from sparserob_core.experiment.comparison.compare import comparison_summary, comparison_table
     from sparserob_core.experiment.comparison.profiles import LISTED, Profiles
-    from sparserob_core.experiment.comparison.studies import ACCURACY
+    from sparserob_core.experiment.comparison.studies import PROFILE_ACCURACY
     from sparserob_core.experiment.run.viewer import recorded, recorder
 
     watched = watch or serve or save is not None or connect is not None
     observers = [recorder(save, serve, connect)] if watched else []
-    options: dict[str, Any] = {"accuracy": ACCURACY if accuracy is None else accuracy, "measure": measure}
+    options: dict[str, Any] = {"accuracy": PROFILE_ACCURACY if accuracy is None else accuracy, "measure": measure}
     comparison = side_by_side(runs, out, **options, observers=observers)
     recordings = [line for observer in observers for line in recorded(observer, save)]
     summary = comparison.summary() if isinstance(comparison, Profiles) else comparison_summary(comparison)

@@ -10,9 +10,9 @@ from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.events import Event
 
-PATIENCE = 2.0  # seconds before the first line
-RENEWED = 0.1  # seconds between two looks of the line on a terminal
-WRITTEN = 5.0  # seconds between two lines anywhere else
+SECONDS_TO_FIRST_LINE = 2.0  # seconds before the first line
+SECONDS_PER_LOOK = 0.1  # seconds between two looks of the line on a terminal
+SECONDS_PER_LINE = 5.0  # seconds between two lines anywhere else
 
 
 @final
@@ -35,8 +35,8 @@ class LiveLine:
     def receive(self, event: Event) -> None:
         """Show an event of a study, whose ``notify`` this method is; events other than `StudyProgress` are ignored."""
         now = time.monotonic()
-        pause = RENEWED if self._is_terminal else WRITTEN
-        if not isinstance(event, StudyProgress) or now - self._start_time < PATIENCE:
+        pause = SECONDS_PER_LOOK if self._is_terminal else SECONDS_PER_LINE
+        if not isinstance(event, StudyProgress) or now - self._start_time < SECONDS_TO_FIRST_LINE:
             return
         if self._has_output and now - self._last_time < pause:
             return

@@ -7,7 +7,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Self, final
 
-from sparserob_core.experiment.cli.shell.live_line import RENEWED, LiveLine
+from sparserob_core.experiment.cli.shell.live_line import SECONDS_PER_LOOK, LiveLine
 from sparserob_core.experiment.config.plain import value_text
 from sparserob_core.experiment.run.events import StudyProgress, SweepProgress
 from sparserob_core.experiment.sweep.study import COLUMNS, short
@@ -17,7 +17,7 @@ from sparserob_core.sip.events import Event
 if TYPE_CHECKING:
     from rich.live import Live
 
-LAST = 12
+SHOWN_ROWS = 12
 """Rows that are shown while a study goes on; the whole table is printed in the end."""
 
 
@@ -28,7 +28,7 @@ class LiveTable:
 
     def __init__(self) -> None:
         self._line = LiveLine()
-        self._rows: deque[list[str]] = deque(maxlen=LAST)
+        self._rows: deque[list[str]] = deque(maxlen=SHOWN_ROWS)
         self._display: Live | None = None
         self._last_time = 0.0
 
@@ -53,7 +53,7 @@ class LiveTable:
         elif isinstance(event, SweepProgress):
             if event.row is not None:
                 self._rows.append([*(value_text(event.row[key]) for key in event.axes), *short(event.row)])
-            if time.monotonic() - self._last_time >= RENEWED:
+            if time.monotonic() - self._last_time >= SECONDS_PER_LOOK:
                 self._show_rows(self._display, event)
         elif isinstance(event, StudyProgress):
             self._display.update(printable(event.text), refresh=True)

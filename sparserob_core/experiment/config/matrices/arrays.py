@@ -11,22 +11,22 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
-LARGEST = 2**31
+MAX_ARRAY_BYTES = 2**31
 """Largest number of bytes of the arrays in one file. No run writes as many, and a small file can claim any number."""
 
 
 def read_arrays(file: Path, largest: int | None = None) -> dict[str, Array]:
     """Return the arrays of an ``.npz`` file by name; none where there is no such file.
 
-    Raises `InputError` where the file cannot be read, or its arrays take more than ``largest`` bytes (`LARGEST` unless
-    given).
+    Raises `InputError` where the file cannot be read, or its arrays take more than ``largest`` bytes (`MAX_ARRAY_BYTES`
+    unless given).
     """
     if not file.is_file():
         return {}
     try:
         with ZipFile(file) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
-        limit = LARGEST if largest is None else largest
+        limit = MAX_ARRAY_BYTES if largest is None else largest
         if size > limit:
             raise InputError(f"{file}: cannot be read: expected arrays of at most {limit} bytes in all, got {size}")
         with np.load(file, allow_pickle=False) as stored:

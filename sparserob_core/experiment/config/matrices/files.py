@@ -20,10 +20,10 @@ from sparserob_core.sip.convex_set import Array
 
 KEYS = {"file", "name"}
 PARTS = ("data", "indices", "indptr", "shape")
-LARGEST = 2**28  # bytes of the arrays of a file; a tenth of it would refuse dense matrices of 2000 states
+MAX_MATRIX_FILE_BYTES = 2**28  # bytes of the arrays of a file; a tenth of it would refuse dense matrices of 2000 states
 # Characters of all matrices of a config, which is read back as one text of at most four million. Ten times more takes
 # a minute to read; a tenth would refuse dense matrices of 200 states.
-MAX_TEXT = 3_500_000
+MAX_PACKED_LETTERS = 3_500_000
 SUFFIX, TABLE = ".npz", ".csv"
 
 
@@ -39,8 +39,10 @@ def resolve(data: dict[str, Any], folder: Callable[[Path], File]) -> Iterator[Co
         try:
             holder[key] = pack(_read_matrix(reference, folder(path), cache).array)
             size += sum(len(text) for text in holder[key].values() if isinstance(text, str))
-            if size > MAX_TEXT:
-                expected = f"matrices of at most {MAX_TEXT} characters together, as a run directory holds them"
+            if size > MAX_PACKED_LETTERS:
+                expected = (
+                    f"matrices of at most {MAX_PACKED_LETTERS} characters together, as a run directory holds them"
+                )
                 raise InputError(expected=expected, got="more")
         except InputError as error:
             yield Complaint(path, str(error))
@@ -75,7 +77,7 @@ def _read_matrix(given: Mapping[str, object], folder: File, known: dict[File, di
     if is_table:
         return read_table(file)
     if file not in known:
-        known[file] = read_arrays(file, LARGEST)
+        known[file] = read_arrays(file, MAX_MATRIX_FILE_BYTES)
     try:
         return matrix_in(known[file], str(name))
     except InputError as error:

@@ -25,7 +25,7 @@ from sparserob_core.sip.convex_set import Array
 
 # Entries of a matrix, with its zeros, as it becomes a dense one. Ten times more are 320 MB for every copy, and no plant
 # of so many states is solved; a tenth would refuse plants of a thousand states.
-MAX_ENTRIES = 4_000_000
+MAX_PACKED_ENTRIES = 4_000_000
 CSR, DENSE = "csr", "dense"
 Whole: TypeAlias = npt.NDArray[np.integer[Any]]
 
@@ -90,9 +90,9 @@ def shape_of(given: object, where: str) -> tuple[int, int]:
     if len(sizes) != 2 or not all(is_count):
         raise InputError(path=where, expected="two whole numbers, rows and columns", got=f"{given!r}"[:60])
     rows, columns = map(int, sizes)
-    if rows * columns > MAX_ENTRIES:
+    if rows * columns > MAX_PACKED_ENTRIES:
         raise InputError(
-            path=where, expected=f"at most {MAX_ENTRIES} entries, zeros included", got=f"{rows} x {columns}"
+            path=where, expected=f"at most {MAX_PACKED_ENTRIES} entries, zeros included", got=f"{rows} x {columns}"
         )
     return rows, columns
 

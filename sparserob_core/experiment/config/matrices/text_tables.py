@@ -10,7 +10,8 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.matrices.packed import Packed, checked, shape_of
 from sparserob_core.experiment.plugins.messages import shown
 
-LARGEST = 2**24  # bytes of a file: a run directory holds four million characters, and ten times more take a minute
+# Bytes of a file: a run directory holds four million characters, and ten times more take a minute
+MAX_TABLE_BYTES = 2**24
 COMMENT = "#"
 
 
@@ -21,8 +22,8 @@ def read_table(file: Path) -> Packed:
     the error names the line.
     """
     try:
-        if file.stat().st_size > LARGEST:
-            raise InputError(path=file.name, expected=f"at most {LARGEST} bytes", got=f"{file.stat().st_size}")
+        if file.stat().st_size > MAX_TABLE_BYTES:
+            raise InputError(path=file.name, expected=f"at most {MAX_TABLE_BYTES} bytes", got=f"{file.stat().st_size}")
         text = file.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(path=file.name, expected="text in UTF-8", got="something else") from None

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 # Bytes of a config, which may hold matrices as one text each. Large data belongs in a file of arrays, or in a plugin
 # that makes it. Ten times more takes half a minute to read; a tenth is a dense matrix of 200 states.
-LARGEST = 4_000_000
-MAX_VALUES = 200_000  # values of a config; an alias counts as all values that it stands for
+MAX_CONFIG_BYTES = 4_000_000
+MAX_CONFIG_VALUES = 200_000  # values of a config; an alias counts as all values that it stands for
 
 __all__ = ["ConfigSource", "read_source", "read_value", "require_readable", "write_yaml"]
 
@@ -106,9 +106,9 @@ def read_source(config: str | File | Mapping[str, Any] | ConfigSource) -> Config
             f"{file}: expected a mapping of keys to values, got"
             f" {'a list' if isinstance(data, list) else repr(data)[:60]}"
         )
-    if _count_values(data, {}) > MAX_VALUES:
+    if _count_values(data, {}) > MAX_CONFIG_VALUES:
         raise ConfigError(
-            f"{file}: expected at most {MAX_VALUES} values, aliases counted as what they stand for, got more"
+            f"{file}: expected at most {MAX_CONFIG_VALUES} values, aliases counted as what they stand for, got more"
         )
     return ConfigSource(str(file), file.resolve().parent, data, "" if file.suffix == ".toml" else text)
 
@@ -116,10 +116,10 @@ def read_source(config: str | File | Mapping[str, Any] | ConfigSource) -> Config
 def require_readable(data: Mapping[str, Any], text: str) -> None:
     """Raise `ConfigError` where a config that was written as ``text`` is larger than `read_source` accepts."""
     size, values = len(text.encode()), _count_values(data, {})
-    if size > LARGEST or values > MAX_VALUES:
+    if size > MAX_CONFIG_BYTES or values > MAX_CONFIG_VALUES:
         raise ConfigError(
-            f"the problem cannot be written: expected at most {LARGEST} bytes and {MAX_VALUES} values, got {size} and"
-            f" {values}"
+            f"the problem cannot be written: expected at most {MAX_CONFIG_BYTES} bytes and {MAX_CONFIG_VALUES} values, "
+            f"got {size} and {values}"
         )
 
 
@@ -127,16 +127,18 @@ def read_value(text: str) -> object:
     """Return the value of an override, read as YAML; raises `ConfigError` where it cannot be read."""
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
-    if len(text) > LARGEST:
-        raise ConfigError(f"override value {text[:40]!r}...: expected at most {LARGEST} characters, got {len(text)}")
+    if len(text) > MAX_CONFIG_BYTES:
+        raise ConfigError(
+            f"override value {text[:40]!r}...: expected at most {MAX_CONFIG_BYTES} characters, got {len(text)}"
+        )
     try:
         value = _make_yaml("safe").load(text)
     except MarkedYAMLError as error:
         raise ConfigError(f"override value {text!r}: {_describe_problem(error)}") from error
     except (YAMLError, RecursionError) as error:
         raise ConfigError(f"override value {text[:60]!r}: not valid YAML: {type(error).__name__}") from None
-    if _count_values(value, {}) > MAX_VALUES:
-        raise ConfigError(f"override value {text[:40]!r}...: expected at most {MAX_VALUES} values, got more")
+    if _count_values(value, {}) > MAX_CONFIG_VALUES:
+        raise ConfigError(f"override value {text[:40]!r}...: expected at most {MAX_CONFIG_VALUES} values, got more")
     return value
 
 
@@ -163,8 +165,10 @@ def _make_yaml(kind: str) -> YAML:
 def _read_text(file: File) -> str:
     try:
         size = file.stat().st_size
-        if size > LARGEST:
-            raise ConfigError(f"{file}: expected at most {LARGEST} bytes, got {size}; a plugin can make large data")
+        if size > MAX_CONFIG_BYTES:
+            raise ConfigError(
+                f"{file}: expected at most {MAX_CONFIG_BYTES} bytes, got {size}; a plugin can make large data"
+            )
         return file.read_bytes().decode("utf-8-sig")
     except FileNotFoundError:
         raise ConfigError(f"{file}: there is no such file") from None

@@ -37,7 +37,8 @@ WRITTEN = {
 """The fields of a problem that are written in addition to lists of constraints; any other field is an error."""
 CALLED = {"start": "from", "stop": "to"}
 """Fields of a term that have another name in a config."""
-MANY = 2500  # entries above which a matrix is packed: nobody reads more, and ten times more fill a config
+# Entries above which a matrix is packed: nobody reads more, and ten times more fill a config
+MAX_WRITTEN_ENTRIES = 2500
 WRITTEN_OF_SYSTEM = {"phases", "parameters", "delay"}
 
 
@@ -164,7 +165,7 @@ def _write_rows(phase: Phase, name: str) -> Any:
     if callable(value):
         return traced(name, value, phase.names, phase.probes)
     matrix: Array = np.asarray(value, dtype=float)
-    return pack(matrix) if matrix.size > MANY else matrix.tolist()
+    return pack(matrix) if matrix.size > MAX_WRITTEN_ENTRIES else matrix.tolist()
 
 
 def _write_parameters(parameters: ConvexSet, names: Sequence[str]) -> dict[str, Any]:

@@ -19,14 +19,15 @@ from sparserob_core.sip.program import TOLERANCE
 from sparserob_core.sip.proof.verdict import verdict
 from sparserob_core.sip.result import Result
 
-SECONDS = 10.0  # for a bound in ball arithmetic, where another bound holds too; where none does there is no limit
+BOUND_SECONDS = 10.0  # for a bound in ball arithmetic, where another bound holds too; where none does there is no limit
 NO_TIME = "there was no time to see what the multipliers prove without rounding"
-ROUNDING = 1e-12  # of a cost
+DERIVED_COST_ROUNDING = 1e-12  # of a cost
 CROSSED = (
     "the lower bound {:.12g} that its multipliers prove is above the cost {:.12g} of a decision that was proven, by"
     " more than the tolerances of the proofs allow: one of the two is wrong, and neither is claimed; {}"
 )
-INWARDS = 1e-13  # share of the bound that is taken off, so that a check with another precision derives no smaller one
+# Share of the bound that is taken off, so that a check with another precision derives no smaller one
+BOUND_ALLOWANCE = 1e-13
 
 
 def bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) -> Result:
@@ -90,7 +91,7 @@ def _derive_bound(experiment: ControlExperiment, result: Result, deadline: Deadl
 
     arguments = experiment.problem, experiment.control, experiment.disturbance
     try:
-        clock = Clock(deadline.at_most(SECONDS if exact else np.inf))
+        clock = Clock(deadline.at_most(BOUND_SECONDS if exact else np.inf))
         derived = derived_bound(Case(*arguments, finite(data), clock, policy=experiment.transcription.policy))
     except (Broken, Unchecked, ZeroDivisionError):
         if not exact:
@@ -98,7 +99,7 @@ def _derive_bound(experiment: ControlExperiment, result: Result, deadline: Deadl
         return rounded
     if derived - result.cost > _compute_allowance(result):
         return replace(rounded, status="failed", message=CROSSED.format(derived, result.cost, ADVICE))
-    lowered = min(derived - INWARDS * abs(derived), result.cost)
+    lowered = min(derived - BOUND_ALLOWANCE * abs(derived), result.cost)
     if not np.isfinite(lowered) or (lowered <= rounded.lower_bound if exact else lowered == rounded.lower_bound):
         return rounded
     improved = replace(rounded, lower_bound=lowered, dual=replace(rounded.dual, bound=lowered))
@@ -114,7 +115,7 @@ def _compute_allowance(result: Result) -> float:
     `sip.working.ledger.alarm` has judged the bound before, in the program's own units.
     """
     units = {proof.family: proof.units for proof in result.proofs}
-    allowed = np.inf if result.dual.mu.size else ROUNDING * abs(result.cost)
+    allowed = np.inf if result.dual.mu.size else DERIVED_COST_ROUNDING * abs(result.cost)
     for cut in result.dual.cuts:
         row_units = units.get(cut.family)
         allowed += np.inf if row_units is None else cut.multiplier * TOLERANCE * float(row_units[cut.row])

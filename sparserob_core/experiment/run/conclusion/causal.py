@@ -20,7 +20,7 @@ from sparserob_core.sip.result import Result
 if TYPE_CHECKING:
     from sparserob_core.control.studies.causal import CausalBound
 
-SECONDS = 20.0  # for a bound in ball arithmetic
+CAUSAL_BOUND_SECONDS = 20.0  # for a bound in ball arithmetic
 WORDS = "; nor does any other causal policy with this dictionary exist: {} signals of the disturbance prove it"
 
 
@@ -98,7 +98,7 @@ def proven(
     causal_bound : CausalBound
         The bound, with its signals and multipliers.
     deadline : Deadline, optional
-        The end of the time; the check takes at most `SECONDS`.
+        The end of the time; the check takes at most `CAUSAL_BOUND_SECONDS`.
 
     Returns
     -------
@@ -117,7 +117,7 @@ def proven(
             model.control,
             model.disturbance,
             {},
-            Clock((deadline or Deadline()).at_most(SECONDS)),
+            Clock((deadline or Deadline()).at_most(CAUSAL_BOUND_SECONDS)),
             policy=policy,
         )
         derived = derived_causal_bound(case, finite(causal_data(causal_bound)), priced=not excludes_all)

@@ -20,7 +20,8 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.working.counting import count, share_of, whole
 
-INWARDS = 1e-9  # share of a bound that is taken off, so that a check with another rounding derives no smaller one
+# Share of a bound that is taken off, so that a check with another rounding derives no smaller one
+COUNT_ALLOWANCE = 1e-9
 ROUNDS, CELLS = 30, 64
 """Rounds, and cells of a proof, that the other program may take where the run's own took fewer. With ten times fewer
 rounds a control in a ball is not reached, as it takes some twenty tangents. With ten times fewer cells a vertex is not
@@ -86,7 +87,7 @@ def _is_proven_better(program: SemiInfiniteProgram, other: Result, count_limit: 
     return (
         proven
         and np.isfinite(count_limit)
-        and count(program, np.asarray(other.decision)) < count_limit * (1.0 - INWARDS)
+        and count(program, np.asarray(other.decision)) < count_limit * (1.0 - COUNT_ALLOWANCE)
     )
 
 
@@ -110,7 +111,7 @@ def _compute_factor(experiment: ControlExperiment) -> float | None:
         for group, size in zip(groups, lengths, strict=True)
         if size > 0.0 and highest[group[0]] > 0.0
     ]
-    return min(shares) * (1.0 - INWARDS) if shares else None
+    return min(shares) * (1.0 - COUNT_ALLOWANCE) if shares else None
 
 
 def longest(bound: ConvexSet, channels: Sequence[int]) -> float:
@@ -122,7 +123,7 @@ def longest(bound: ConvexSet, channels: Sequence[int]) -> float:
 
 
 def _round_down(program: SemiInfiniteProgram, least: float) -> float:
-    return whole(program, least - INWARDS * abs(least)) if np.isfinite(least) else -np.inf
+    return whole(program, least - COUNT_ALLOWANCE * abs(least)) if np.isfinite(least) else -np.inf
 
 
 def _compute_share(program: SemiInfiniteProgram, counted: float) -> float | None:

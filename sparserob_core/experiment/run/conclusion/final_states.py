@@ -10,7 +10,7 @@ from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.sip.proof.verdict import verdict
 from sparserob_core.sip.result import Result
 
-SECONDS = 20.0  # for an enclosure in ball arithmetic
+ENCLOSURE_SECONDS = 20.0  # for an enclosure in ball arithmetic
 OUTWARDS = 1.0 + 1e-12  # factor of the errors, so that a check with another precision derives no larger ones
 
 
@@ -59,7 +59,7 @@ def _enclose_errors(model: Transcription, result: Result) -> np.ndarray | None:
 
     assert result.decision is not None
     theta = model.nominal(result.decision).reshape(model.problem.system.controls, -1)
-    case = Case(model.stated, model.control, model.disturbance, {"decision": theta.tolist()}, Clock(SECONDS))
+    case = Case(model.stated, model.control, model.disturbance, {"decision": theta.tolist()}, Clock(ENCLOSURE_SECONDS))
     try:
         with ctx.workprec(precision_of(case)):
             error_bounds = [float(error_bound.upper()) * OUTWARDS for error_bound, _ in compute_residuals(case)]

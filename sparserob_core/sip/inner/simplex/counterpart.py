@@ -32,17 +32,17 @@ from sparserob_core.sip.inner.simplex.silence import silent
 from sparserob_core.sip.inner.simplex.tangents import Tangents
 from sparserob_core.sip.solver import AccountedSolver, QuadraticProgram
 
-ACCURACY = 1e-10  # of rows and reduced costs: the least that HiGHS takes
+HIGHS_ACCURACY = 1e-10  # of rows and reduced costs: the least that HiGHS takes
 # Residuals of an answer of somebody else, in rows of length 1. Ten times more, and a row that was imposed is violated
 # by more than the margins by which rows are tightened (1e-8); ten times less, and it is more than was asked for.
 BELIEVED = 1e-9
 # An answer that misses more is not asked for with fewer digits: a first-order method needs seconds for each, and does
 # not mend what is off by so much. With a hundredth, answers that a second time mends are given up.
-FAR = 1e-4
+HOPELESS_RESIDUAL = 1e-4
 # Of what is added up to the cost: by how much its tangents may be below it. HiGHS meets rows to 1e-10, and there is one
 # tangent of every term, so that ten times less may not be reached; ten times more is a tenth of a gap that is asked for
 # at 1e-8.
-FLAT = 1e-9
+TANGENT_SHORTFALL = 1e-9
 TOUCHED = 60  # rounds of tangents: each quarters what squares are below, 30 leave 1e-18 of it
 # Steps from the last basis for each row and column, after which there is no end to them: a program of 918 columns and
 # 1 835 rows went in circles from there, and took 1 188 steps from nothing. With a tenth of it programs that come to an
@@ -51,15 +51,16 @@ STALLED = 10
 # Numbers in the rows, from which on a program without a basis is solved by the interior point method of HiGHS, which
 # ends at one too. With half of them both take as long; with 480 000, of a policy that answers one noisy output on 40
 # pieces, the simplex method took 35 000 steps to the optimum and went in circles from there, where this takes 9 s.
-LARGE = 200_000
+INTERIOR_POINT_NUMBERS = 200_000
 # Steps from the last basis for each row and column of such a program, after which it is begun anew: that takes as long
 # as so many. With ten times as many one round took more than a minute; with a tenth of them small rounds begin anew.
-PATIENT = 0.25
+STEPS_PER_ROW_AND_COLUMN = 0.25
 ROBUST = "feedback"  # what these programs are called where a solver fails on some
 PERTURBED = 1e-4  # of slopes: what a perturbed cost may leave; a hundredth of it is seen, and 1e-2 is another entry's
-PASSES = 20  # of least squares within bounds, at most: what is left of a slope after some lowers a bound, which holds
+# Of least squares within bounds, at most: what is left of a slope after some lowers a bound, which holds
+LEAST_SQUARES_PASSES = 20
 INNER = 20  # steps of the simplex method that one of an interior point method takes as long as
-SAME = 1e-12  # points of a set that are closer are one
+SAME_POINT_DISTANCE = 1e-12  # points of a set that are closer are one
 DRAWN = (
     2.0**-41
 )  # by which deviations of sets that are no boxes are drawn inwards, so that they are shown to be in them
@@ -248,7 +249,7 @@ class Counterpart:
                 worst, index = deviations[index], index + 1
                 for span, name, points, at in part.points:
                     point = worst[span]
-                    if any(np.abs(point - previous).max() <= SAME for previous in points):
+                    if any(np.abs(point - previous).max() <= SAME_POINT_DISTANCE for previous in points):
                         continue
                     points.append(point)
                     at.append(first + len(limits))
@@ -298,7 +299,7 @@ class Counterpart:
             if self._tangents is None:
                 break
             shortfall, decided, roots = self._tangents.below(columns)
-            if shortfall <= max(accuracy, FLAT * self.program.added(decided)) or not rounds:
+            if shortfall <= max(accuracy, TANGENT_SHORTFALL * self.program.added(decided)) or not rounds:
                 break  # the last ones are not sharpened: their multipliers are those of the rows that were solved with
             self._tangents.sharpen(decided, roots)
         n, mu = self.program.n, rows[self._equality_rows]
@@ -431,10 +432,10 @@ class Counterpart:
         is_inner &= np.abs(residual) <= PERTURBED * max(1.0, float(np.abs(slope).max(initial=0.0)))
         columns = np.flatnonzero(is_inner)
         residual = residual[columns]
-        if np.abs(residual).max(initial=0.0) <= ACCURACY:
+        if np.abs(residual).max(initial=0.0) <= HIGHS_ACCURACY:
             return
         shares = table[:, columns].T.toarray() * y[active]
-        y[active] *= np.maximum(1.0 + np.linalg.lstsq(shares, -residual, rcond=SAME)[0], 0.0)
+        y[active] *= np.maximum(1.0 + np.linalg.lstsq(shares, -residual, rcond=SAME_POINT_DISTANCE)[0], 0.0)
 
     def _refine_deviations(self, slope: Array, free: np.ndarray, y: Array, deviations: Array) -> None:
         """Correct the deviations of rows, such that less slope is left in the variables that answer them.
@@ -469,11 +470,15 @@ class Counterpart:
             weights = radius * np.array([total for _, _, _, total in answering])
             table = np.stack([line.toarray()[0][columns] for line in lines], axis=1) * weights
             room = np.maximum(1.0 - np.abs(shares), 0.0)  # what is inside of its set moves first
-            change = room * np.clip(np.linalg.lstsq(table * room, -slope[columns], rcond=SAME)[0], -1.0, 1.0)
+            change = room * np.clip(
+                np.linalg.lstsq(table * room, -slope[columns], rcond=SAME_POINT_DISTANCE)[0], -1.0, 1.0
+            )
             refined = np.clip(shares + change, -1.0, 1.0)
             slope[columns] += table @ (refined - shares)
             limits = np.nextafter(-1.0 - refined, -np.inf), np.nextafter(1.0 - refined, np.inf)
-            change = lsq_linear(table, -slope[columns], limits, "bvls", SAME, max_iter=PASSES).x
+            change = lsq_linear(
+                table, -slope[columns], limits, "bvls", SAME_POINT_DISTANCE, max_iter=LEAST_SQUARES_PASSES
+            ).x
             final = np.clip(refined + change, -1.0, 1.0)
             slope[columns] += table @ (final - refined)
             for (_, rows, signs, _), share in zip(answering, final.tolist(), strict=True):
@@ -498,8 +503,8 @@ class Growing:
         for name, value in {
             "output_flag": False,
             "threads": 1,
-            "primal_feasibility_tolerance": ACCURACY,
-            "dual_feasibility_tolerance": ACCURACY,
+            "primal_feasibility_tolerance": HIGHS_ACCURACY,
+            "dual_feasibility_tolerance": HIGHS_ACCURACY,
         }.items():
             self.highs.setOptionValue(name, value)
 
@@ -569,8 +574,8 @@ class Growing:
             reason = answer
         self._extend_basis()
         self.highs.setOptionValue("time_limit", self.highs.getRunTime() + max(seconds, 0.0))  # none of an earlier call
-        has_basis, large = bool(self.highs.getBasis().valid), self.highs.getNumNz() >= LARGE
-        patience = PATIENT if has_basis and large else STALLED
+        has_basis, large = bool(self.highs.getBasis().valid), self.highs.getNumNz() >= INTERIOR_POINT_NUMBERS
+        patience = STEPS_PER_ROW_AND_COLUMN if has_basis and large else STALLED
         self.highs.setOptionValue("simplex_iteration_limit", int(patience * (self.columns + self.count)))
         steps = self._run_highs(inside=large and not has_basis)
         status, stalled = self.highs.getModelStatus(), highspy.HighsModelStatus
@@ -615,14 +620,14 @@ class Growing:
             np.array(program.col_upper_),
         )
         message = ""
-        for accuracy in (ACCURACY, BELIEVED):  # the last digit that is asked for may cost the others
+        for accuracy in (HIGHS_ACCURACY, BELIEVED):  # the last digit that is asked for may cost the others
             try:
                 claim = asked.solve(posed, accuracy)
             except Exception as error:  # noqa: BLE001  a foreign solver may raise anything; its failure must not be ours
                 return str(error) if isinstance(error, PluginError) else f"the solver raised {named(error)}"
             if claim.met(posed, BELIEVED):
                 break
-            if not claim.met(posed, FAR):
+            if not claim.met(posed, HOPELESS_RESIDUAL):
                 return claim.message
             note = "; its rows, bounds, slopes or gap are missed by more than 1e-9"
             message = message or f"{claim.message}{note if claim.status == 'solved' else ''}"

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # Seconds that HiGHS has to end after it was asked to, for which it looks once an iteration. Without any it would go on
 # beside what is done with the answer; with ten times as many a presolve, which does not look, keeps a terminal waiting.
-GRACE = 0.5
+HIGHS_GRACE_SECONDS = 0.5
 # Seconds after which a signal is heard that another thread has caught. With a tenth of them this thread takes a
 # noticeable share of the processor; ten times as many are a second.
 LOOK = 0.1
@@ -54,7 +54,7 @@ def run(highs: Any) -> None:
             pass
     except KeyboardInterrupt:
         stop.set()
-        if not finished.wait(GRACE):
+        if not finished.wait(HIGHS_GRACE_SECONDS):
             atexit.register(finished.wait)  # a thread that asks for the interpreter after its end aborts the process
         raise
     finally:

@@ -23,7 +23,7 @@ Entries = list[tuple[np.ndarray, np.ndarray, Array]]
 # Of the largest eigenvalue one that is rounding, as LAPACK computes them. Ten times less, and rounding of P counts as
 # squares, which cost variables; ten times more, and up to 1e-14 of the cost at its bounds is left out of the program
 # (not of what is claimed: costs are recomputed, and bounds are those of tangents of P itself).
-RESOLVED = 1e-15
+ROUNDED_EIGENVALUE = 1e-15
 # Slopes by which the rows of tangents are divided, at least: so what HiGHS leaves of a row is a share of a root, not of
 # a square. (Undivided, policies whose cost is squares alone ended with gaps of 1.8e-7 after 202 programs; divided, they
 # close after 25.) A hundredth of it changes nothing there, and puts entries of 1e6 beside dust; ten thousand times as
@@ -149,7 +149,7 @@ def _factor_quadratic(program: FiniteProgram) -> Array:
     P: Any = program.P
     variables = np.flatnonzero(np.diff(P.indptr))
     values, vectors = np.linalg.eigh(P[variables][:, variables].toarray())
-    kept = values > RESOLVED * variables.size * values.max(initial=0.0)
+    kept = values > ROUNDED_EIGENVALUE * variables.size * values.max(initial=0.0)
     roots = np.zeros((program.n, int(kept.sum())))
     roots[variables] = vectors[:, kept] * np.sqrt(values[kept])
     return roots

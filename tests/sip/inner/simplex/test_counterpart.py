@@ -258,8 +258,8 @@ def test_large_programs_are_begun_from_inside_and_end_at_the_same_optimum(
     rng = np.random.default_rng(3)  # one of which the second rows ask for steps of both
     base, blocks = program(rng), [rows(rng, "several"), rows(rng, "several", 0.3)]
     steps = solved(Counterpart(base, SPREADS[name]), blocks)
-    monkeypatch.setattr(simplex, "LARGE", 0)
-    monkeypatch.setattr(simplex, "PATIENT", patient)
+    monkeypatch.setattr(simplex, "INTERIOR_POINT_NUMBERS", 0)
+    monkeypatch.setattr(simplex, "STEPS_PER_ROW_AND_COLUMN", patient)
     ways, run = list[bool](), Growing._run_highs
     monkeypatch.setattr(Growing, "_run_highs", lambda self, inside: ways.append(inside) or run(self, inside))
     large = Counterpart(base, SPREADS[name])

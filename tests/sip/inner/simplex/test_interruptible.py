@@ -50,7 +50,7 @@ def test_an_interrupt_ends_the_solver() -> None:
 
 
 def test_who_does_not_look_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(interruptible, "GRACE", 0.01)
+    monkeypatch.setattr(interruptible, "HIGHS_GRACE_SECONDS", 0.01)
     waited: list[Any] = []
     monkeypatch.setattr(interruptible.atexit, "register", waited.append)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a script runs this beside itself
@@ -78,7 +78,7 @@ def test_who_does_not_look_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_after_an_interrupt_the_same_program_is_solved(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(interruptible, "GRACE", 20.0)  # a loaded machine hears late
+    monkeypatch.setattr(interruptible, "HIGHS_GRACE_SECONDS", 20.0)  # a loaded machine hears late
     highs = highspy.Highs()
     for name, value in (("output_flag", False), ("solver", "simplex"), ("presolve", "off")):
         highs.setOptionValue(name, value)
