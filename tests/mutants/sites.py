@@ -30,7 +30,10 @@ EXTREMA = [
     ("ceil", "floor"),
 ]  # fmt: skip
 OTHER = {a: b for pair in EXTREMA for a, b in (pair, pair[::-1])}
-OUTWARD = re.compile(r"^_?(OUTWARD|ROUNDING|HALF_ULP|ULP|EPS|ROUNDED|ROUNDOFF|ABOVE|TINY)$")
+OUTWARD = re.compile(
+    r"^_?((\w+_)?OUTWARD(_FACTOR)?|(\w+_)?ROUND(ING|ED|OFF|INGS_PER_STEP)|HALF_ULP|ULP|EPS|ABOVE|TINY"
+    r"|NEGLIGIBLE(_DIRECTION)?_ENTRY|OUTSIDE_SPAN_SHARE)$"
+)
 TOLERANCES = re.compile(r"tolerance", re.IGNORECASE)
 REST = re.compile(
     r"^_?(tails?|rests?|remainders?|lost|errors?|excess|rad|radius|radii|slack|bends?|bent|off|left_out|kinks|spare|"
@@ -129,7 +132,7 @@ def _constant(source: Source, node: ast.AST) -> Changes:
 
 def _outward(source: Source, node: ast.AST) -> Changes:
     if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load) and OUTWARD.match(node.id):
-        yield source.span(node), "1.0" if node.id.strip("_") == "OUTWARD" else "0.0"
+        yield source.span(node), "1.0" if "OUTWARD" in node.id else "0.0"
     if isinstance(node, ast.Call):
         name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
         if name == "nextafter" and node.args:

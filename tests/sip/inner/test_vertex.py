@@ -38,7 +38,7 @@ def test_few_entries_give_the_same_optimum_as_all_of_them(number: int) -> None:
     rng = np.random.default_rng(number)
     made = program(rng, number)
     guess = None if number % 2 else np.abs(rng.normal(size=made.h.size))
-    with patch.multiple(module, NEAREST=int(rng.integers(5, 100)), SHARE=0.0):
+    with patch.multiple(module, NEAREST=int(rng.integers(5, 100)), NEAREST_SHARE=0.0):
         found = sifted(made, guess)
     truth = simplex(made)
     assert found.status == truth.status
