@@ -156,7 +156,8 @@ def test_what_a_disturbance_moves_is_found_without_rounding() -> None:
     assert find_independent(loop, [[1, 0], [0, 1]])[1] == [0, 1]  # they are one in each mode, in another way
     below = [["0", "0", "0"], ["t", "0", "0"], ["0", "0", "1"]]
     timed = VaryingSystem.of(below, [["1"], ["1"], ["1"]], 4.0, [["1", "1"], ["0", "exp(1e-17 + 0*t)"], ["0", "0"]])
-    found = find_independent(loop_of(timed, GRIDS["alike"], Box(-np.ones(2), np.ones(2))), [[1, 0], [0, 1]])
+    with ctx.workprec(192):
+        found = find_independent(loop_of(timed, GRIDS["alike"], Box(-np.ones(2), np.ones(2))), [[1, 0], [0, 1]])
     assert found[:2] == ([0, 1], [0, 1])  # columns that differ by 1e-17 are two, and the third state is reached by none
 
 
