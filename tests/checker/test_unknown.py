@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flint import arb, arb_mat, ctx
+from flint import arb, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.models import kepler_root
@@ -23,7 +23,6 @@ from sparserob_core.checker.problem import disturbances
 from sparserob_core.checker.problem.held import HeldComponents, on_one_grid
 from sparserob_core.checker.problem.time_varying import make_time_varying
 from sparserob_core.checker.reach import followed as followed_rows
-from sparserob_core.checker.reach.preimages import ReachableSubspace
 from sparserob_core.checker.sets import flat
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies import policy
@@ -142,11 +141,6 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         lambda: VerifiedFlow(Plant.of(sr.LinearSystem([[-1e9]], [[1.0]]), 1.0), 1.0).marks([0.0, 1.0]),
         Unchecked,
         "too fast for its horizon",
-    ),
-    "numbers that are not exact": (
-        lambda: ReachableSubspace.of([(arb_mat([[arb(1, 0.1)]]), arb_mat([[1]]))], [[1]]),
-        Unchecked,
-        "the numbers of the system are not exact",
     ),
     "a time before the system begins": (
         lambda: VerifiedFlow(Plant.of(ROOT, 1.0), 1.0).step(-0.5, 0.0),

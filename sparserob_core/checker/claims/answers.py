@@ -346,7 +346,16 @@ class NamedDeviations:
     def entering(self) -> list[list[arb]]:
         """Contribution of the deviations to the state at every breakpoint since the one before, ``(K, d)``, where the
         whole state is measured."""
-        return self._see(self.z)
+        return [
+            [
+                sum(
+                    (response[s, b] * x for block, response in responses.items() for b, x in enumerate(self.z[block])),
+                    ball(0),
+                )
+                for s in range(self.loop.outputs)
+            ]
+            for responses in self.loop.innovation_matrices
+        ]
 
     @property
     def middles(self) -> NamedDeviations:
@@ -354,30 +363,11 @@ class NamedDeviations:
         return NamedDeviations(self.case, self.loop, [[ball(0)] * len(block) for block in self.z])
 
     @property
-    def innovations(self) -> list[list[arb]]:
-        """The innovations at every breakpoint, ``(K, p)``, less those under points of the sets next to the middles. A
+    def answered(self) -> list[list[arb]]:
+        """The deviations that gains answer, block by block: those from points of the sets next to the middles. A
         rounded middle may lie outside of a thin set, and differences from it outside of its span."""
         pairs = zip(self.z, self.loop.deviations.rests, strict=True)
-        z = [
-            [ball(0)] * len(deviation)
-            if deviation is inner_deviation
-            else [x - r for x, r in zip(deviation, inner_deviation, strict=True)]
-            for deviation, inner_deviation in pairs
-        ]
-        return self._see(z)
-
-    def _see(self, z: Sequence[Sequence[arb]]) -> list[list[arb]]:
-        """Return the innovations at every breakpoint, ``(K, p)``, that deviations make block by block."""
-        return [
-            [
-                sum(
-                    (response[s, b] * x for block, response in responses.items() for b, x in enumerate(z[block])),
-                    ball(0),
-                )
-                for s in range(self.loop.outputs)
-            ]
-            for responses in self.loop.innovation_matrices
-        ]
+        return [[ball(0)] * len(z) if z is rest else [x - r for x, r in zip(z, rest, strict=True)] for z, rest in pairs]
 
     def given(self, direction: Array, time: float) -> arb:
         """Return the contribution of disturbance and initial state to ``c'x(t)``, ``c (d,)``, without control."""

@@ -25,7 +25,7 @@ from sparserob_core.checker.problem.integrals import integrating, spelt
 from sparserob_core.checker.problem.returning import RETURN, returning
 from sparserob_core.checker.problem.superposition import parted
 from sparserob_core.checker.problem.time_varying import make_time_varying
-from sparserob_core.checker.problem.timing import Timing, before
+from sparserob_core.checker.problem.timing import Timing, before, join_breakpoints
 from sparserob_core.checker.reach.followed import FollowedRows
 from sparserob_core.checker.reach.inner_loop import NoInnerLoop, VerifiedInnerLoop, lost_digits
 from sparserob_core.checker.reach.sources import Sources
@@ -80,6 +80,9 @@ class Case:
             problem, dictionary = on_one_grid(self.problem, self.disturbance)
             object.__setattr__(self, "problem", problem)
             object.__setattr__(self, "disturbance", dictionary)
+        times = np.union1d(self.control.breakpoints, self.control.breakpoints + self.problem.system.delay)
+        breakpoints = join_breakpoints(self.disturbance.breakpoints, times)
+        object.__setattr__(self, "disturbance", self.disturbance.on(breakpoints))
         if self.policy is not None and self.control.functions == self.control.pieces:
             # as many independent functions as pieces make every control on these; the certificate writes its values
             object.__setattr__(self, "control", Dictionary.indicators(self.control.breakpoints))

@@ -109,14 +109,14 @@ def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
     row = case.duality.step_row(direction, time)
     if named is None:
         return [(y, row)]
-    answered_row = _answer(case, row, named, named.innovations)
+    answered_row = _answer(case, row, named)
     if time != float(case.control.breakpoints[-1]):
         return [(y, answered_row)]
     next_deviations, zero = feedback_of(case).following(named, entry, name), ball(0)
     zero_slopes = [[zero] * direction.size] * (case.control.pieces - 1)
     return [
         (y, replace(answered_row, slope=[*zero_slopes, balls(-direction)])),
-        (y, ConstraintRow(zero, [balls(direction), *zero_slopes], None, next_deviations.innovations)),
+        (y, ConstraintRow(zero, [balls(direction), *zero_slopes], None, next_deviations.answered)),
     ]
 
 
@@ -133,15 +133,13 @@ def _derive_state_row(
     if named is None:
         return row
     contribution = named.given(direction[: case.problem.system.states], time)
-    return _answer(case, replace(row, constant=row.constant + contribution), named, named.innovations)
+    return _answer(case, replace(row, constant=row.constant + contribution), named)
 
 
-def _answer(
-    case: Case, row: ConstraintRow, named: NamedDeviations, innovations: Sequence[Sequence[arb]]
-) -> ConstraintRow:
-    """Return a row on the control under named deviations as one on the decided part of the control, which answers these
-    innovations."""
-    return feedback_of(case).on_decided(replace(row, innovations=innovations), named)
+def _answer(case: Case, row: ConstraintRow, named: NamedDeviations) -> ConstraintRow:
+    """Return a row on the control under named deviations as one on the decided part of the control, which answers
+    them."""
+    return feedback_of(case).on_decided(replace(row, deviations=named.answered), named)
 
 
 def _charges_peaks(case: Case) -> bool:
@@ -182,12 +180,7 @@ def _derive_control_row(
     row, piece = case.duality.control_row(direction, time), case.duality.control_piece(time)
     if named is not None:
         named = named.middles if name == PEAK and case.charge != PEAK else named  # then the nominal control is charged
-        innovations = named.innovations
-        measured_innovations = [
-            *innovations[: piece + 1],
-            *([x * 0 for x in innovation] for innovation in innovations[piece + 1 :]),
-        ]
-        row = _answer(case, row, named, measured_innovations)
+        row = _answer(case, row, named)
     if name != PEAK:
         return row
     if sorted(np.abs(direction).tolist()) != [0.0] * (direction.size - 1) + [1.0]:
@@ -205,7 +198,7 @@ def _derive_effort_row(case: Case, shares: Array, named: NamedDeviations | None)
         [price * ball(shares[i * K + k]) for i, price in enumerate(costs)] for k, costs in enumerate(case.price.costs)
     ]
     row = ConstraintRow(ball(0), slope, None, (), EFFORT)
-    return row if named is None else _answer(case, row, named, named.innovations)
+    return row if named is None else _answer(case, row, named)
 
 
 def fixed_limit(case: Case, direction: Array, time: float) -> arb:

@@ -40,15 +40,16 @@ class ConstraintRow:
 
     ``slope`` is a list of ``m`` balls per piece of the control; ``sizes (K, m)`` are nonnegative numbers, or ``None``.
 
-    A control with feedback is ``u_k = v_k + sum_j M_kj innovations_j`` at the deviations that a certificate names, with
-    ``innovations (K, p)``. A control without feedback has no innovations, and its row is that of the worst deviations.
+    A control with feedback is ``u_k = v_k + sum_j M_kj e_j``, with the innovations ``e_j`` of its ``deviations``.
+    A certificate names these, block by block; the nominal control has none. A control without feedback has none either,
+    and its row is that of the worst deviations.
     ``charged`` is 0, or with ``(k, i)`` the peak of that piece and channel, or with `EFFORT` the effort.
     """
 
     constant: arb
     slope: list[list[arb]]
     sizes: Array | None = None
-    innovations: Sequence[Sequence[arb]] = ()
+    deviations: Sequence[Sequence[arb]] = ()
     charged: tuple[int, int] | str | None = None
 
 

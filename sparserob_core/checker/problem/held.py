@@ -12,6 +12,7 @@ from flint import arb
 
 from sparserob_core.checker.arithmetic.balls import ball
 from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.problem.timing import SAME
 from sparserob_core.checker.sets.polynomials import OUTWARD, rounding
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.sets.sets import Product
@@ -19,8 +20,6 @@ from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from sparserob_core.control.problem.problem import OptimalControlProblem
-
-SAME = 1e-12  # relative to the horizon: nearer breakpoints are one up to rounding, as in a problem's records
 
 
 def on_one_grid(problem: OptimalControlProblem, dictionary: Dictionary) -> tuple[OptimalControlProblem, Dictionary]:

@@ -13,6 +13,8 @@ from sparserob_core.checker.outcome import Clock
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.sip.convex_set import Array
 
+SAME = 1e-12  # relative to the horizon: nearer breakpoints are one up to rounding, as in a problem's records
+
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -58,3 +60,13 @@ def before(problem: OptimalControlProblem) -> list[float]:
     return (
         [0.0] * problem.system.controls if initial_control is None else [float(u) for u in np.asarray(initial_control)]
     )
+
+
+def join_breakpoints(times: Array, others: Array) -> Array:
+    """Return the increasing ``times``, of which those that differ from one of the ``others`` by rounding only are
+    replaced by it. Otherwise a control would measure what happens between the two."""
+    after = np.clip(np.searchsorted(others, times), 1, others.size - 1)
+    before, behind = others[after - 1], others[after]
+    nearest = np.where(times - before <= behind - times, before, behind)
+    joined: Array = np.where(np.abs(nearest - times) <= SAME * times[-1], nearest, times)
+    return joined if (np.diff(joined) > 0.0).all() else times

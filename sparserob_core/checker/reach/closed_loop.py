@@ -12,7 +12,6 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, final
@@ -24,9 +23,8 @@ from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import around, exactly, identity, stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
-from sparserob_core.checker.flow.plant import Plant, modes_at
+from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.reach.deviations import Deviations
-from sparserob_core.checker.reach.preimages import ReachableSubspace
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
@@ -122,15 +120,6 @@ class VerifiedLoop:
         constant on it."""
         Phi, _, Delta = self.flow.over(self.grid[piece], self.grid[piece + 1])
         return Phi.matrix, Delta.matrix
-
-    def find_reachable_subspace(self, vectors: Sequence[Sequence[Fraction]]) -> ReachableSubspace:
-        """Return which states a block of the disturbance along ``vectors (q, mw)`` reaches. For a system that may
-        change with time, only the positions of entries that may differ from 0 are used."""
-        if not self.flow.plant.is_timed:
-            return ReachableSubspace.of([(mode["A"], mode["E"]) for mode in modes_at(self.system, ())], vectors)
-        d, m = self.flow.states, self.flow.driven
-        is_nonzero = self.flow.law.there
-        return ReachableSubspace.linked(is_nonzero[:, :d], is_nonzero[:, d + m :], vectors)
 
     @cached_property
     def innovation_matrices(self) -> list[dict[int, arb_mat]]:

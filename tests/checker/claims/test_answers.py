@@ -520,11 +520,13 @@ def test_innovations_of_a_flat_set_are_those_of_differences_of_its_points():
         ):
             assert float(abs(sum(a * x for a, x in zip(exact, point, strict=True)) - limit).upper()) < 1e-26
         assert known(shape).member(about) is not None and not known(shape).holds(balls(about))
-        seen = named.innovations[1]  # a piece of length 1 after which the state is what the disturbance was
+        seen = replace(named, z=named.answered).entering[
+            1
+        ]  # a piece of length 1 after which the state is what the disturbance was
         assert [float(x.mid()) for x in seen] == pytest.approx(flat.support_point(line) - about)
         assert float(abs(sum(a * x for a, x in zip(exact, seen, strict=True))).upper()) < 1e-26
         calm = feedback_of(case).following(named, {}, "row")
-        assert all(x.is_zero() for row in calm.innovations for x in row)
+        assert all(x.is_zero() for block in calm.answered for x in block)
 
 
 def test_chords_of_a_thin_set_are_those_of_its_segments_and_else_along_the_axes():

@@ -224,7 +224,8 @@ def test_a_row_is_what_the_policy_makes_of_it_at_its_deviations(name: str) -> No
             ((y, row),) = bounds.rows_of(case, {**entry, **named, "multiplier": 2.0})
             assert y == 2.0
             slope = np.array([[float(g.mid()) for g in piece] for piece in row.slope])
-            seen = np.array([[float(e.mid()) for e in part] for part in row.innovations])
+            answered = replace(feedback_of(case).named(named, "row"), z=row.deviations).entering
+            seen = np.array([[float(e.mid()) for e in part] for part in answered])
             made = v.T + np.einsum("kjmp,jp->km", M, seen)
             assert float(row.constant.mid()) + (slope * made).sum() == pytest.approx(truth, abs=1e-9), entry
     with pytest.raises(Broken, match="no constraint"):

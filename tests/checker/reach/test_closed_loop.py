@@ -17,7 +17,6 @@ from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.claims.cells import prove
 from sparserob_core.checker.outcome import Broken, Clock
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
-from sparserob_core.checker.reach.preimages import ReachableSubspace
 from sparserob_core.checker.reach.tube import LoopTube, TimelessTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters
@@ -248,24 +247,6 @@ def test_an_innovation_adds_up_what_a_disturbance_did_on_every_part_of_its_piece
             )
             found = [{b: float(push[0, 0].mid()) for b, push in one.items()} for one in loop.innovation_matrices]
             assert found == seen
-
-
-def test_who_sees_what_in_a_system_in_t_follows_from_where_its_numbers_are_not_zero():
-    """Whatever the numbers are: what a graph of arrows from entry to state to state reaches."""
-    rng = np.random.default_rng(5)
-    for _ in range(40):
-        d, mw = (int(n) for n in rng.integers(1, 6, 2))
-        A, E = (rng.uniform(1.0, 2.0, size) * (rng.random(size) < 0.3) for size in ((d, d), (d, mw)))
-        entries = sorted(rng.choice(mw, int(rng.integers(1, mw + 1)), replace=False).tolist())
-        seen = np.zeros((d, len(entries)), dtype=bool)
-        for place, entry in enumerate(entries):
-            reached = set(np.flatnonzero(E[:, entry]).tolist())
-            while more := {i for j in reached for i in np.flatnonzero(A[:, j]).tolist()} - reached:
-                reached |= more
-            seen[list(reached), place] = True
-        found = ReachableSubspace.linked(A != 0.0, E != 0.0, np.eye(mw, dtype=int)[entries].tolist())
-        assert found.pattern.tolist() == seen.tolist()
-        assert (found.states, found.entries) == (seen.any(axis=1).sum(), seen.any(axis=0).sum())
 
 
 def test_the_error_of_a_chord_holds_all_that_is_lost_in_rational_numbers(monkeypatch):
