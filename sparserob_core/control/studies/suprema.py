@@ -168,9 +168,10 @@ def bound_row(
     notify: Notify = ignore,
     deadline: Deadline | None = None,
 ) -> BoundedRow:
-    """Enclose the worst case of a row at the control ``theta (m, N)``, to a ``tolerance`` relative to it, or to
-    `MIN_ROW_SHARE` of the largest value that the row has anywhere in its window, or of its unit where that is 0 but for
-    rounding. Dictionaries are those of control and disturbance."""
+    """Enclose the worst case of a row at the control ``theta (m, N)``, to a ``tolerance`` relative to it.
+
+    At least `MIN_ROW_SHARE` of the largest value that the row has anywhere in its window counts as its size, or of its
+    unit where that is 0 but for rounding. Dictionaries are those of control and disturbance."""
     worst = followed(problem, dictionaries, theta, row)
     if worst is not None:
         return _bound_known_row(worst, row, tolerance, notify, deadline)
