@@ -183,9 +183,11 @@ def test_fences_carry_known_attributes_only() -> None:
 
 
 @pytest.mark.slow
-def test_the_python_of_the_readme_is_typed_as_the_package_is(tmp_path: Path) -> None:
+def test_the_python_of_the_readme_and_its_plugin_are_typed_as_the_package_is(tmp_path: Path) -> None:
     snippets = [fence.text for fence in fences(ROOT / "README.md") if fence.language == "python"]
-    assert snippets
+    extending = fences(ROOT / "docs" / "extending.md")
+    snippets += [fence.text for fence in extending if fence.attributes.get("title") == "gentle.py"]
+    assert len(snippets) >= 2
     for number, text in enumerate(snippets):
         (tmp_path / f"snippet{number}.py").write_text(text)
     check = [
