@@ -172,13 +172,13 @@ def bound_row(
 
     At least `MIN_ROW_SHARE` of the largest value that the row has anywhere in its window counts as its size, or of its
     unit where that is 0 but for rounding. Dictionaries are those of control and disturbance."""
-    worst = followed(problem, dictionaries, theta, row)
+    worst = follow_row(problem, dictionaries, theta, row)
     if worst is not None:
         return _bound_known_row(worst, row, tolerance, notify, deadline)
     return _bound_by_program(problem, dictionaries, theta, row, tolerance, notify, deadline)
 
 
-def followed(
+def follow_row(
     problem: OptimalControlProblem, dictionaries: tuple[Dictionary, Dictionary], theta: Array, row: Row
 ) -> WorstRow | None:
     """The row by its adjoint; ``None`` where the system has parameters or pieces, or changes with time, or where
