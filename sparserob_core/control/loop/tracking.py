@@ -107,8 +107,9 @@ class FutureEffects(Protocol):
 
 @final
 class Tracking:
-    """Solver for `is_trackable` transcriptions from one initial state ``(d,)`` after another. With ``answering``, the
-    control also has gains that do not change; ``own`` is then the remaining problem if nothing happens."""
+    """Solver for transcriptions that `is_trackable` accepts, from one initial state ``(d,)`` after another. With
+    ``answering``, the control also has gains that do not change; ``own`` is then the remaining problem if nothing
+    happens."""
 
     def __init__(self, own: Transcription, answering: Callable[[Array], FutureEffects] | None = None) -> None:
         problem, response, steps = own.problem, own.response, own.response.steps(KNOWN)
