@@ -20,8 +20,8 @@ class Lipo(sr.Maximiser, sr.Options):
     A point ``x`` is evaluated only if ``min_i f(x_i) + constant |x - x_i| >= max_i f(x_i)``. Candidates are drawn in
     turn from the whole box and from ever smaller boxes around the best point; the first of each evaluation is uniform.
     If the constant is right, the best value after ``n`` evaluations is therefore never below that of the ``n``
-    independent uniform points that these first candidates are, seed by seed (the paper compares the distributions for
-    uniform candidates, and proves an exponentially falling regret where ``f* - f(x) >= c |x - x*|``). Where 1024
+    independent uniform points that these first candidates are, seed by seed. The paper compares the distributions for
+    uniform candidates, and proves an exponentially falling regret where ``f* - f(x) >= c |x - x*|``. Where 1024
     candidates are excluded, that of the highest bound among the last is evaluated: the search never hangs.
 
     Upper bound: the highest Lipschitz bound over a partition of the box, proven provided that the constant is one;

@@ -48,7 +48,7 @@ def ignore(event: Event) -> None:
     """Ignore an event."""
 
 
-def forwarded(notify: Notify, kind: type[T], complete: Callable[[T], Event]) -> Notify:
+def forward_events(notify: Notify, kind: type[T], complete: Callable[[T], Event]) -> Notify:
     """Return a listener that passes every event on to ``notify``, and completes the events of one kind.
 
     Parameters

@@ -198,7 +198,7 @@ class Unexplained(Explanation):
         return worst
 
 
-def told_apart(one: float, two: float) -> tuple[str, str]:
+def distinguish_numbers(one: float, two: float) -> tuple[str, str]:
     """Return two numbers as texts of four digits, or of as many more as make the texts differ."""
     texts = [(f"{one:.{digits}g}", f"{two:.{digits}g}") for digits in range(4, 17)]
     return next((pair for pair in texts if pair[0] != pair[1]), texts[-1])
@@ -570,7 +570,7 @@ class ConstraintFamily:
         if self.cells is None:
             return box.lower[None], box.upper[None]
         lower, upper = self.cells
-        missing = uncovered(lower, upper, box)
+        missing = find_uncovered_point(lower, upper, box)
         if missing is not None:
             raise self._make_error("cells", "cells that cover the index set", f"none around {missing.tolist()}")
         return lower, upper
@@ -665,7 +665,7 @@ class ConstraintFamily:
         return G, h
 
 
-def uncovered(lower: Array, upper: Array, box: Box) -> Array | None:
+def find_uncovered_point(lower: Array, upper: Array, box: Box) -> Array | None:
     """Return a point of the box that lies in none of the cells; ``None`` where the cells cover the box.
 
     The corners of all cells divide the box into a grid, and each part of the grid is inside a cell or outside of it. A

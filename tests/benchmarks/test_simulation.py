@@ -12,7 +12,7 @@ import sparserob_core as sr
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
-from sparserob_core.control.studies.simulate import fine_times, finer, simulate_states
+from sparserob_core.control.studies.simulate import fine_times, refine_grid, simulate_states
 from sparserob_core.control.transcription.transcribe import prepare
 
 PIECES, TRAJECTORIES, LOOPED = 250, 10_000, 20
@@ -63,7 +63,7 @@ def test_many_trajectories_cost_far_less_than_a_loop_over_them():
     )
     model = prepare(problem, dictionary, dictionary)
     times = fine_times(model.response, ParameterIndex(None), np.zeros(0))
-    fine = Response(problem.system, finer(model.response.grid, times), model.response.initial_state)
+    fine = Response(problem.system, refine_grid(model.response.grid, times), model.response.initial_state)
     rng = np.random.default_rng(0)
     control, disturbances = rng.uniform(-1, 1, (1, PIECES)), rng.uniform(-0.06, 0.06, (2000, 2, PIECES))
     started = time.perf_counter()

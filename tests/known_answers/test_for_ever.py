@@ -14,7 +14,7 @@ from scipy.linalg import expm
 import sparserob_core as sr
 from sparserob_core.checker.claims import case as cases
 from sparserob_core.checker.problem import returning
-from sparserob_core.control.loop.remaining import remaining
+from sparserob_core.control.loop.remaining import remaining_problem
 from sparserob_core.control.problem.terms.repeat import WITHIN, Return
 
 MASS = {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]}
@@ -116,7 +116,7 @@ def test_what_is_left_of_a_period_steps_to_the_control_that_begins_the_next(tmp_
     keys = {"system": {"A": [[0]], "B": [[1]], "c": [-0.5]}, "horizon": 2.0, "initial_state": [0.7]}
     config = _config(2, "open_loop", **keys, control_step={"box": 0.2})
     model = _run(tmp_path / "run", config).experiment.transcription
-    left = remaining(model, 1, np.array([0.7]), np.array([0.5]), again=np.array([0.4])).problem
+    left = remaining_problem(model, 1, np.array([0.7]), np.array([0.5]), again=np.array([0.4])).problem
     seam = next(one for one in left.path if one.name == "seam")
     assert not left.repeat
     assert (np.asarray(seam.G) @ [0.6] <= np.asarray(seam.h) + 1e-12).all()

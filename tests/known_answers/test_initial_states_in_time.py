@@ -175,8 +175,8 @@ def asked(config: Config, direction: np.ndarray, radius: float = RADIUS) -> tupl
 def test_bounds_hold_for_all_steps_that_are_as_far_off_as_they_may_be(
     ends: np.ndarray, policy: Config | None, terminal: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of steps that may be off by 3 in 1 000 of what is added up, the furthest initial state is that of a linear
-    program whose rows give way by as much, from the farthest initial state of the plane."""
+    """Where steps may be off by 3 in 1 000 of what is added up, the furthest initial state is that of a linear program.
+    Its rows give way by as much, from the farthest initial state of the plane."""
     monkeypatch.setattr(Propagator, "slack", OFF)
     direction = np.array([0.6, -0.8])
     _, result = asked(changed(SPRING, policy, terminal=[terminal]), direction)

@@ -1,6 +1,6 @@
-"""Guards known answers: measurable disturbances where systems take turns, where the control acts late, where it is a
-sum of functions, in a window, and beside others that are constant on pieces, against a program on a fine grid, values
-by hand, and forgeries."""
+"""Guards known answers: measurable disturbances of switched systems, with delays, with a control that is a sum of
+functions, in a window, and beside others that are constant on pieces. They are compared with a program on a fine grid,
+values by hand, and forgeries."""
 
 from __future__ import annotations
 

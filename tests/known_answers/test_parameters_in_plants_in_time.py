@@ -18,7 +18,7 @@ import sparserob_core as sr
 from sparserob_core.checker.flow import flows
 from sparserob_core.control.reach.over_cells import FunctionalsOverCells
 from sparserob_core.control.studies.initial_states import InitialPlane
-from sparserob_core.control.transcription.rounding import rounded_down
+from sparserob_core.control.transcription.rounding import reduce_bound
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
@@ -475,11 +475,11 @@ def test_what_a_law_leaves_out_lowers_the_bound_by_as_much_as_its_rows_weigh(
 ) -> None:
     outcome = sr.run(INSIDE, out=tmp_path / "run", quiet=True, figures=False)
     model = assemble(load_config(INSIDE)).transcription
-    plain = rounded_down(model, outcome.result, None).lower_bound
+    plain = reduce_bound(model, outcome.result, None).lower_bound
     monkeypatch.setattr(FunctionalsOverCells, "truncation", lambda *_: np.full(1, 1e-3))
     weighed = sum(
         abs(cut.multiplier) * float(np.abs(said.direction).sum())
         for cut, said in zip(outcome.result.dual.cuts, model.explained(outcome.result.dual.cuts), strict=True)
     )
     assert weighed > 0.0
-    assert plain - rounded_down(model, outcome.result, None).lower_bound == pytest.approx(1e-3 * weighed)
+    assert plain - reduce_bound(model, outcome.result, None).lower_bound == pytest.approx(1e-3 * weighed)

@@ -12,9 +12,9 @@ import pytest
 import yaml
 
 import sparserob_core as sr
-from sparserob_core.control.loop.remaining import remaining
+from sparserob_core.control.loop.remaining import remaining_problem
 from sparserob_core.control.studies.answer import ControlResult
-from sparserob_core.control.studies.horizons import at_horizon
+from sparserob_core.control.studies.horizons import shorten_horizon
 from sparserob_core.experiment.check.check import check
 
 # x' = u over four pieces of length 1: from 3 to 0 it takes three of them
@@ -139,7 +139,7 @@ def test_what_is_left_of_a_plan_pays_the_later_prices(tmp_path: Path) -> None:
     whole = model.problem.prices(model.control.breakpoints)
     np.testing.assert_allclose(whole, [[3.0, 7.0, 4.0, 2.0]])
     for piece in range(4):
-        left = remaining(model, piece, np.zeros(1), None)
+        left = remaining_problem(model, piece, np.zeros(1), None)
         np.testing.assert_allclose(left.problem.prices(left.control.breakpoints), whole[:, piece:])
         np.testing.assert_allclose(left.program.finite.weights, whole[0, piece:])
 
@@ -183,8 +183,8 @@ def test_rows_that_are_no_prices_are_refused_by_their_key(weights: object, expec
 
 def test_a_shorter_horizon_keeps_the_prices_until_then(tmp_path: Path) -> None:
     problem = model_of(tmp_path / "run", [[0, 1], [1.5, 2], [3, 4]]).problem
-    assert at_horizon(problem, 3.0).weights.tolist() == [[0, 1], [1.5, 2]]  # type: ignore[union-attr]
-    assert at_horizon(problem, 1.0).weights.tolist() == [1]  # type: ignore[union-attr]
+    assert shorten_horizon(problem, 3.0).weights.tolist() == [[0, 1], [1.5, 2]]  # type: ignore[union-attr]
+    assert shorten_horizon(problem, 1.0).weights.tolist() == [1]  # type: ignore[union-attr]
 
 
 def test_a_loop_pays_for_groups_and_for_the_channels_beside_them(tmp_path: Path) -> None:

@@ -236,8 +236,8 @@ def test_with_an_alphabet_any_control_is_proven_before_the_sparsest_one(monkeypa
         gaps.append(gap)
         return propose(program, relaxed, rows, letters, gap)
 
-    propose = sparsest.proposed
-    monkeypatch.setattr(sparsest, "proposed", spied)
+    propose = sparsest.propose_decision
+    monkeypatch.setattr(sparsest, "propose_decision", spied)
     given = {**ridden("moving", 8), "method": {"name": "sparsest", "alphabet": [0, 0.5, 1.0, 1.5, 3.0, 6.0]}}
     result = sr.run(given, quiet=True, figures=False).result
     assert result.status == "certified"

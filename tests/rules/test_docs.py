@@ -8,6 +8,7 @@ second one runs every page as a reader does, in a shell.
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import os
 import re
@@ -119,20 +120,34 @@ def test_links_between_pages_lead_somewhere() -> None:
 
 
 LONGEST = 40  # words of a sentence; 25 are many
-PLAIN = [ROOT / "docs" / name for name in ("live.md", "programs.md")]
-"""Pages whose sentences are counted; others join them as they are written anew."""
+CODE = re.compile(r"\$\$.+?\$\$|``.+?``|`[^`]+`|\$[^$\n]+\$", re.DOTALL)
+BREAKS = re.compile(r"\n\s*\n|^\s*(?:-{3,}|[-*#>|]|\d+\.) *| \| |(?<=\.)\n", re.MULTILINE)
 
 
-@pytest.mark.parametrize("page", PLAIN, ids=relative)
-def test_no_sentence_is_longer_than_a_reader_can_follow(page: Path) -> None:
-    text = FENCE.sub("", page.read_text())
-    parts = (part for block in re.split(r"\n\s*\n|^[-#|] *", text, flags=re.MULTILINE) for part in split(block))
-    assert not [sentence for sentence in parts if len(sentence.split()) > LONGEST]
+def long_sentences(text: str) -> list[str]:
+    """Return the sentences of a text with too many words. A formula is one word; a cell or an item stands alone."""
+    plain = CODE.sub("code", FENCE.sub("", text))
+    parts = (part for block in BREAKS.split(plain) for part in re.split(r"(?<=[.!?:;])\s+", " ".join(block.split())))
+    return [sentence for sentence in parts if len(sentence.split()) > LONGEST]
 
 
-def split(block: str) -> list[str]:
-    """Return the sentences of a paragraph: what ends with a full stop, a colon or a semicolon ends one."""
-    return re.split(r"(?<=[.!?:;])\s+", " ".join(block.split()))
+DOCSTRING = re.compile(r'^ *"""(?=[\w`])(.*?)"""', re.DOTALL | re.MULTILINE)
+
+
+def docstrings(path: Path) -> Iterator[str]:
+    """Yield the docstrings with enough words for a long sentence, without literal blocks and examples."""
+    for text in DOCSTRING.findall(path.read_text()):
+        if len(text.split()) > LONGEST:
+            yield re.sub(r"::\n\n(?: {4}.*\n|\n)+", "\n\n", inspect.cleandoc(text)).split("\n>>>")[0]
+
+
+def test_no_sentence_of_a_page_or_a_docstring_is_longer_than_a_reader_can_follow() -> None:
+    modules = [
+        path for folder in ("sparserob_core", "plugins", "tests") for path in sorted((ROOT / folder).rglob("*.py"))
+    ]
+    texts = [(page, page.read_text()) for page in (*PAGES, ROOT / "CHANGELOG.md", ROOT / "tests/mutants/README.md")]
+    texts += [(path, text) for path in modules for text in docstrings(path)]
+    assert not [f"{relative(path)}: {sentence}" for path, text in texts for sentence in long_sentences(text)]
 
 
 def cells(line: str) -> int:
@@ -168,9 +183,11 @@ def test_fences_carry_known_attributes_only() -> None:
 
 
 @pytest.mark.slow
-def test_the_python_of_the_readme_is_typed_as_the_package_is(tmp_path: Path) -> None:
+def test_the_python_of_the_readme_and_its_plugin_are_typed_as_the_package_is(tmp_path: Path) -> None:
     snippets = [fence.text for fence in fences(ROOT / "README.md") if fence.language == "python"]
-    assert snippets
+    extending = fences(ROOT / "docs" / "extending.md")
+    snippets += [fence.text for fence in extending if fence.attributes.get("title") == "gentle.py"]
+    assert len(snippets) >= 2
     for number, text in enumerate(snippets):
         (tmp_path / f"snippet{number}.py").write_text(text)
     check = [

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.sip.program import TOLERANCE, WorstConstraint, uncovered
+from sparserob_core.sip.program import TOLERANCE, WorstConstraint, find_uncovered_point
 from sparserob_core.sip.working.ledger import contradiction
 
 
@@ -144,28 +144,31 @@ def test_cells_that_were_halved_cover_and_without_one_of_them_do_not(seed, d):
         low[axis] = high[axis] = cut
         lower = np.vstack([lower[:i], lower[i : i + 1], low, lower[i + 1 :]])
         upper = np.vstack([upper[:i], high, upper[i : i + 1], upper[i + 1 :]])
-    assert uncovered(lower, upper, box) is None
+    assert find_uncovered_point(lower, upper, box) is None
     gone = int(rng.integers(len(lower)))
     kept = np.arange(len(lower)) != gone
-    missing = uncovered(lower[kept], upper[kept], box)
+    missing = find_uncovered_point(lower[kept], upper[kept], box)
     assert missing is not None and (missing > lower[gone]).all() and (missing < upper[gone]).all()
     doubled = np.append(np.flatnonzero(kept), np.flatnonzero(kept)[:3])  # as much volume or more, and a gap
-    assert uncovered(lower[doubled], upper[doubled], box) is not None
+    assert find_uncovered_point(lower[doubled], upper[doubled], box) is not None
 
 
 def test_cells_may_overlap_stand_still_along_a_side_and_miss_by_rounding():
     box = sr.Box([0.0, 2.0], [1.0, 2.0])
-    assert uncovered(np.array([[0.0, 2.0], [0.4, 2.0]]), np.array([[0.5, 2.0], [1.0, 2.0]]), box) is None
+    assert find_uncovered_point(np.array([[0.0, 2.0], [0.4, 2.0]]), np.array([[0.5, 2.0], [1.0, 2.0]]), box) is None
     third = np.array([[0.0], [1.0 / 3.0 + 1e-16]])
-    assert uncovered(third, np.array([[1.0 / 3.0], [1.0]]), sr.Box([0.0], [1.0])) is None
-    assert uncovered(np.array([[0.0], [0.5 + 1e-9]]), np.array([[0.5], [1.0]]), sr.Box([0.0], [1.0])) is not None
+    assert find_uncovered_point(third, np.array([[1.0 / 3.0], [1.0]]), sr.Box([0.0], [1.0])) is None
+    assert (
+        find_uncovered_point(np.array([[0.0], [0.5 + 1e-9]]), np.array([[0.5], [1.0]]), sr.Box([0.0], [1.0]))
+        is not None
+    )
 
 
 def test_a_grid_that_is_too_large_is_compared_by_volume(monkeypatch):
     monkeypatch.setattr("sparserob_core.sip.program.MAX_GRID_PARTS", 1)
     box = sr.Box([0.0, 0.0], [1.0, 1.0])
-    assert uncovered(np.zeros((1, 2)), np.ones((1, 2)), box) is None
-    assert uncovered(np.zeros((1, 2)), np.array([[1.0, 0.999]]), box) is not None
+    assert find_uncovered_point(np.zeros((1, 2)), np.ones((1, 2)), box) is None
+    assert find_uncovered_point(np.zeros((1, 2)), np.array([[1.0, 0.999]]), box) is not None
 
 
 @pytest.mark.parametrize("method", ["exchange", "sparserob"])

@@ -1,7 +1,6 @@
 """Families of every kind that problems make: flat, moving, mixed and curved path sets, terminal sets, steps and the
-control's own set, of known and of uncertain systems and of those that change with time, with integrals, under
-disturbances that jump or are measurable and errors of execution, with and without a control that answers what it
-measures."""
+control's own set. They are of known systems, of uncertain ones, of those that change with time, and with integrals.
+Disturbances jump or are measurable, commands have errors, and controls answer measurements or not."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.shape import basis_of, width
 from sparserob_core.checker.sets.sides import Bounded, Curved, Sides
-from sparserob_core.control.problem.names import joined, measured_in, unit_of_row
+from sparserob_core.control.problem.names import join_units, measured_in, unit_of_row
 from sparserob_core.control.sets.sets import Box
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -101,7 +101,7 @@ def _format_units(case: Case, window: ConstraintWindow) -> str:
     """Return the units of the rows of a window in words; none for a curved set, judged along its gauge."""
     sides = window.shape.halfspaces()
     rows = () if sides is None else sides[0]
-    return joined(unit_of_row(row, case.problem.names, window.states).strip() for row in rows)
+    return join_units(unit_of_row(row, case.problem.names, window.states).strip() for row in rows)
 
 
 def normals_of(window: ConstraintWindow, data: object) -> Array:
@@ -311,7 +311,7 @@ def compute_middle_effect(case: Case, state: int) -> arb:
 def of_fixed(case: Case) -> str:
     """Return the units of the fixed states in words."""
     units = case.problem.names.state_units
-    return joined(units[state] if units else "" for state, _ in case.equalities)
+    return join_units(units[state] if units else "" for state, _ in case.equalities)
 
 
 def _is_uncertain(case: Case, state: int) -> bool:

@@ -23,7 +23,7 @@ from sparserob_core.sip.program import (
     SemiInfiniteProgram,
     Unexplained,
     WorstConstraint,
-    told_apart,
+    distinguish_numbers,
 )
 
 NEGLIGIBLE_TERM = 1e-12  # of the largest coefficient of a combination, one that is rounding
@@ -228,7 +228,7 @@ class TimedExplanation(Explanation):
         if residual.any():
             return self._describe_uncontrollable(other, residual, share, allowed, shift)
         if shift > 0:
-            shift_words, room_words = told_apart(shift / 2 / self.scale, allowed / 2 / self.scale)
+            shift_words, room_words = distinguish_numbers(shift / 2 / self.scale, allowed / 2 / self.scale)
             verb = "move" if " and " in self.cause else "moves"
             return (
                 f"the {self.cause} alone {verb} {self.quantity} by {shift_words}{self._unit_suffix}, {self._set_name}"
@@ -283,7 +283,7 @@ class TimedExplanation(Explanation):
             if self.sigma > 0
             else ""
         )
-        can, must = told_apart(needed - amount, needed)
+        can, must = distinguish_numbers(needed - amount, needed)
         return (
             f"the control can {verb} {self.quantity} by at most {can}{self._unit_suffix}, and {must}{self._unit_suffix}"
             f" is needed{note}: without control it is {self.free / self.scale:.4g}{self._unit_suffix}, {self._set_name}"

@@ -76,7 +76,7 @@ class Uncertain(Protocol):
         index holds."""
 
 
-def indexed(constraint: Uncertain, index_set: Box, start: Array, source: ConstraintSource) -> ConstraintFamily:
+def build_family(constraint: Uncertain, index_set: Box, start: Array, source: ConstraintSource) -> ConstraintFamily:
     """Return a constraint as a family; in its literal form, deviations are part of the index."""
     family = ConstraintFamily(
         name=constraint.name,
@@ -161,7 +161,7 @@ class FeedbackConstraint(ConstraintSource):
             np.linspace(0, self.times.size - 1, min(FIRST_TIMES, self.times.size)).round().astype(int)
         )
         source = self if self.exact else self.flat
-        family = indexed(self, Box(np.array([start]), np.array([stop])), self.times[positions][:, None], source)
+        family = build_family(self, Box(np.array([start]), np.array([stop])), self.times[positions][:, None], source)
         family = replace(family, scale=self.scale)
         return replace(family, scaled=self.scaled) if self.loop.scales else family
 
@@ -400,7 +400,7 @@ class FeedbackControl(ConstraintSource):
     def family(self) -> ConstraintFamily:
         """Return the constraint as a family."""
         index_set = Box(self.places.starts[:1], np.array([self.places.stop]))
-        family = indexed(self, index_set, self.places.times[:, None], self)
+        family = build_family(self, index_set, self.places.times[:, None], self)
         family = replace(family, scaled=self.scaled) if self.loop.scales else family
         return family if self.bound is None else replace(family, defines=True)
 

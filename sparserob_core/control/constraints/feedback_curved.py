@@ -17,7 +17,7 @@ import numpy as np
 from sparserob_core.control.constraints.control import Places
 from sparserob_core.control.constraints.curved import FIRST_STEP
 from sparserob_core.control.constraints.explanation import ConstraintSource, TimedExplanation, of_gauge
-from sparserob_core.control.constraints.feedback import acting, describe_deviations, indexed, rows_at
+from sparserob_core.control.constraints.feedback import acting, build_family, describe_deviations, rows_at
 from sparserob_core.control.constraints.local_maxima import climb
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop
 from sparserob_core.control.problem.units import Units
@@ -62,7 +62,7 @@ class FeedbackCurvedControl(ConstraintSource):
         positions = np.unique(np.linspace(0, times.size - 1, min(FIRST_PLACES, times.size)).round().astype(int))
         axes = np.vstack([np.eye(self._cube_dimension), -np.eye(self._cube_dimension)])
         start = np.hstack([np.repeat(times[positions], len(axes))[:, None], np.tile(axes, (positions.size, 1))])
-        family = indexed(self, index_set, start, self)
+        family = build_family(self, index_set, start, self)
         return replace(family, scaled=self.scaled) if self.loop.scales else family
 
     def scaled(self, factor: float) -> ConstraintFamily:

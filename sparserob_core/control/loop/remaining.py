@@ -9,7 +9,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.terms.windows import MixedConstraint
 from sparserob_core.control.response.time_grid import SAME_TIME
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.control.transcription.terms.accumulated import in_rows
+from sparserob_core.control.transcription.terms.accumulated import combine_states
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
@@ -25,7 +25,7 @@ def refuse_remaining(model: Transcription) -> None:
         "disturbances of one class": len(classes) > 1,
         "disturbances on the pieces of one dictionary": problem.disturbance_breakpoints is not None,
         "integrals of controls alone, and none beside feedback: what states add up to between measurements is not"
-        " known": any(model.feedback is not None or np.any(entry.H) for entry in in_rows(model.stated).integral),
+        " known": any(model.feedback is not None or np.any(entry.H) for entry in combine_states(model.stated).integral),
         "a control that acts at once, without a delay": problem.system.delay > 0.0,
         "a policy without an inner loop (prestabilise: null)": model.response.inner.acts,
         "a policy that measures the whole state, not outputs": model.feedback is not None
@@ -39,7 +39,7 @@ def refuse_remaining(model: Transcription) -> None:
             raise InputError(f"solving the remaining horizon needs {wanted}", path="resolve")
 
 
-def remaining(
+def remaining_problem(
     model: Transcription,
     piece: int,
     state: Array,

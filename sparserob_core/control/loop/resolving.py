@@ -12,9 +12,9 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.feedback.innovations import DEPENDENT, KNOWN
-from sparserob_core.control.loop.remaining import refuse_remaining, remaining
-from sparserob_core.control.loop.retuning import Retuning, retuned
-from sparserob_core.control.loop.tracking import Tracking, trackable
+from sparserob_core.control.loop.remaining import refuse_remaining, remaining_problem
+from sparserob_core.control.loop.retuning import Retuning, replace_control
+from sparserob_core.control.loop.tracking import Tracking, is_trackable
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.time_grid import SAME_TIME
 from sparserob_core.control.transcription.record import Transcription
@@ -222,7 +222,7 @@ class Resolving:
         if self._seconds is None:
             return
         state, start_time = np.asarray(self._model.problem.initial_state, dtype=float), clock.perf_counter()
-        remaining(self._model, 0, state, None)
+        remaining_problem(self._model, 0, state, None)
         self._transcription_seconds = clock.perf_counter() - start_time
         self._solve_seconds = WHOLE * self._transcription_seconds
         if self._model.feedback is not None:
@@ -277,7 +277,7 @@ class Resolving:
             return tuned
         start_time, full = clock.perf_counter(), Solved(None)
         with suppress(SparseRobError, OutOfTime):
-            model = remaining(self._model, piece, state, before)
+            model = remaining_problem(self._model, piece, state, before)
             gap = float(self._model.control.breakpoints[piece] - self._model.control.breakpoints[plan.first])
             result = answered_in_own_units(partial(self._solve_from_cuts, plan.cuts, gap), model.program, tools)
             known_cost = plan.remaining_cost(piece - plan.first, innovations)
@@ -294,7 +294,7 @@ class Resolving:
     def _solve_from_cuts(self, cuts: Sequence[Cut], gap: float, program: SemiInfiniteProgram, tools: Tools) -> Result:
         """Solve a program in its own units by the exchange method, starting from the ``cuts`` of an earlier solve. The
         program begins ``gap`` later than the program in which these cuts were active."""
-        return self._method.close(program, tools, prover_of(program, tools), shifted(cuts, gap, program))
+        return self._method.close(program, tools, prover_of(program, tools), shift_cuts(cuts, gap, program))
 
     def _retune(self, plan: ProvenPlan, piece: int, state: Array, innovations: Sequence[Array], tools: Tools) -> Solved:
         """Solve for the best nominal control with the same gains, where `Retuning` accepts the problem."""
@@ -308,7 +308,7 @@ class Resolving:
         tracked = retuning.solve(plan_piece, state, tools.deadline.at_most(np.inf))
         if tracked is None:
             return Solved(None)
-        decision = retuned(
+        decision = replace_control(
             plan.known, plan.decision, plan_piece, plan.remaining_control(plan_piece, innovations), tracked.decision
         )
         tuned = replace(plan, decision=decision)
@@ -356,7 +356,7 @@ class Resolving:
             program,
             tools,
             prover_of(program, replace(tools, notify=ignore)),
-            shifted(plan.cuts, gap, program),
+            shift_cuts(plan.cuts, gap, program),
         )
         control_units = np.repeat(units.controls, own.control.functions)
         decision = None if result.decision is None else result.decision * control_units
@@ -403,14 +403,14 @@ class Resolving:
         problem."""
         if piece not in self._trackers:
             own = self._prepare_problem(piece, state)[1]
-            self._trackers[piece] = Tracking(own) if trackable(own) else None
+            self._trackers[piece] = Tracking(own) if is_trackable(own) else None
         return self._trackers[piece]
 
     def _prepare_problem(self, piece: int, state: Array) -> tuple[Transcription, Transcription, Units]:
         """Return the remaining problem in the user's units, the same problem in its own units, and these units. The
         initial state is the first one that was asked for at this piece."""
         if piece not in self._prepared_problems:
-            model = remaining(self._model, piece, state, None)
+            model = remaining_problem(self._model, piece, state, None)
             self._prepared_problems[piece] = (model, *in_own_units(model))
         return self._prepared_problems[piece]
 
@@ -420,7 +420,7 @@ class Resolving:
         """Return the remaining problem from this state in the user's units, the same problem in its own units, and
         these units."""
         if self._model.problem.control_step is not None:
-            model = remaining(self._model, piece, state, before, again=self._next_control)
+            model = remaining_problem(self._model, piece, state, before, again=self._next_control)
             return (model, *in_own_units(model))
         model, own, units = self._prepare_problem(piece, state)
         return from_state(model, state), from_state(own, state / units.states), units
@@ -445,7 +445,7 @@ def is_cheaper(cost: float, known: float) -> bool:
     return cost < known - BETTER * max(abs(known), abs(cost))
 
 
-def shifted(cuts: Sequence[Cut], gap: float, program: SemiInfiniteProgram) -> Violated:
+def shift_cuts(cuts: Sequence[Cut], gap: float, program: SemiInfiniteProgram) -> Violated:
     """Return cuts, given in the user's units, as rows of a program in its own units that begins ``gap`` later.
 
     Cuts of the past, and of constraints that are over, are left out. For a family that holds for every deviation, the

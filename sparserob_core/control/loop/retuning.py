@@ -14,8 +14,8 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.control.loop.remaining import remaining
-from sparserob_core.control.loop.tracking import Tracked, Tracking, trackable
+from sparserob_core.control.loop.remaining import remaining_problem
+from sparserob_core.control.loop.tracking import Tracked, Tracking, is_trackable
 from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import SparseRobError
@@ -85,7 +85,7 @@ class Retuning:
         if signal is None or signal.starts is None or signal.starts.size != grid.pieces or not _is_plain_problem(model):
             return None
         try:
-            remainder = remaining(model, piece, state, None, alone=True)
+            remainder = remaining_problem(model, piece, state, None, alone=True)
         except SparseRobError:
             return None
         control = remainder.problem.control
@@ -95,7 +95,7 @@ class Retuning:
                 constraint.divided(row_units(constraint, control)) for constraint in remainder.constraints
             ),
         )
-        if not trackable(remainder):
+        if not is_trackable(remainder):
             return None
         tracking = Tracking(remainder, lambda H: Kept(model, self.decision, piece, H))
         return tracking if tracking.limited else None
@@ -109,7 +109,7 @@ def _is_plain_problem(model: Transcription) -> bool:
     return is_plain and model.response.uniform and grid.pieces == model.control.pieces
 
 
-def retuned(model: Transcription, decision: Array, piece: int, remaining_control: Array, found: Array) -> Array:
+def replace_control(model: Transcription, decision: Array, piece: int, remaining_control: Array, found: Array) -> Array:
     """Return the decision with another control from ``piece`` on: ``found (m K',)`` instead of ``remaining_control (m,
     K')``. The nominal control moves by the difference."""
     changed = decision.copy()

@@ -57,7 +57,7 @@ class _Instants:
     support_values: Array
 
 
-def trackable(own: Transcription) -> bool:
+def is_trackable(own: Transcription) -> bool:
     """Return whether `Tracking` accepts a transcription, given in its own units: a linear open-loop program of a known
     system, with flat constraints, a box of controls around 0, and windows that end at breakpoints of equal pieces."""
     problem, grid, program, model = own.problem, own.response.grid, own.program, own.functionals.disturbance
@@ -107,8 +107,9 @@ class FutureEffects(Protocol):
 
 @final
 class Tracking:
-    """Solver for `trackable` transcriptions from one initial state ``(d,)`` after another. With ``answering``, the
-    control also has gains that do not change; ``own`` is then the remaining problem if nothing happens."""
+    """Solver for transcriptions that `is_trackable` accepts, from one initial state ``(d,)`` after another. With
+    ``answering``, the control also has gains that do not change; ``own`` is then the remaining problem if nothing
+    happens."""
 
     def __init__(self, own: Transcription, answering: Callable[[Array], FutureEffects] | None = None) -> None:
         problem, response, steps = own.problem, own.response, own.response.steps(KNOWN)

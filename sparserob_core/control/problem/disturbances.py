@@ -5,7 +5,8 @@ Disturbances ``E_i w_i`` with ``w_i`` in ``W_i`` act as ``[E_1 E_2 ...] w`` does
 problem with one disturbance, and every proof for one disturbance holds for the list.
 
 * Two classes: the single disturbance is a `Product`, each part of which has its own class. The disturbances of one
-  class are in the set that is 0 along the columns of the other class; the effects of both classes are added (`apart`).
+  class are in the set that is 0 along the columns of the other class; the effects of both classes are added
+  (`select_class`).
 * A window of time: the disturbance enters a system with several phases, in which ``E`` is 0 outside of the window.
 * Different grids: the single disturbance is constant on the intervals of the common refinement. A part that has a
   coarser grid is held over several of these intervals.
@@ -109,7 +110,7 @@ class Disturbance:
             raise InputError(error.sentence, path=f"{where}.E") from None
 
 
-def joined(
+def join_disturbances(
     system: System, every: Sequence[Disturbance], horizon: float
 ) -> tuple[System, ConvexSet, Classes, Breakpoints | None]:
     """Return a system under all disturbances together, and the single disturbance that replaces them.
@@ -175,7 +176,7 @@ def joined(
     return system.in_phases(phases), *set_and_classes, grids
 
 
-def apart(bound: ConvexSet | None, classes: Classes, kind: DisturbanceClass) -> ConvexSet | None:
+def select_class(bound: ConvexSet | None, classes: Classes, kind: DisturbanceClass) -> ConvexSet | None:
     """Return the set of the disturbances of one class, which is 0 along the columns of the other classes.
 
     Parameters

@@ -331,7 +331,7 @@ def unit_of_row(normal: npt.NDArray[np.float64], names: Names, states: int | Non
     return measured_in(normal, names, states) if numbers else ""
 
 
-def joined(units: Iterable[str]) -> str:
+def join_units(units: Iterable[str]) -> str:
     """Return the unit of a number that belongs to one of several rows, with a space before it.
 
     The result is ``m`` where all rows have this unit, ``m or m/s`` where rows differ, and empty where a unit is not

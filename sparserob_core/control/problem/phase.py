@@ -20,7 +20,7 @@ from sparserob_core.control.sets.strangers import require_consistent
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import Float, dense, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
-from sparserob_core.sip.expressions.expression import ExpressionMatrix, above, join_columns
+from sparserob_core.sip.expressions.expression import ExpressionMatrix, join_columns, stack_matrices
 from sparserob_core.sip.expressions.taylor import TaylorModel, TaylorSpace
 
 Matrix: TypeAlias = npt.ArrayLike | Callable[..., object] | ExpressionMatrix
@@ -271,11 +271,11 @@ class Phase:
         k, d = rows.shape
         blocks = {"B": inputs, "E": np.zeros((k, self.disturbances)), "c": np.zeros((k, 1))}
         extended = {
-            name: above(self._get_entry(name), block)
+            name: stack_matrices(self._get_entry(name), block)
             for name, block in blocks.items()
             if name != "c" or self.c is not None
         }
-        A = above(join_columns(self._get_entry("A"), np.zeros((d, k))), np.hstack([rows, np.zeros((k, k))]))
+        A = stack_matrices(join_columns(self._get_entry("A"), np.zeros((d, k))), np.hstack([rows, np.zeros((k, k))]))
         return replace(self, A=A, B=extended["B"], E=extended["E"], c=extended.get("c"))
 
     @shaped

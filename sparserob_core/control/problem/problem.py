@@ -18,13 +18,13 @@ from sparserob_core.control.problem.disturbances import (
     Classes,
     Disturbance,
     DisturbanceClass,
-    apart,
-    joined,
+    join_disturbances,
+    select_class,
 )
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
-from sparserob_core.control.problem.terms.repeat import RETURN, SET_ROUNDING, Repeating, ending, widths
+from sparserob_core.control.problem.terms.repeat import RETURN, SET_ROUNDING, Repeating, require_return, widths
 from sparserob_core.control.problem.terms.windows import (
     MixedConstraint,
     PathConstraint,
@@ -33,7 +33,7 @@ from sparserob_core.control.problem.terms.windows import (
     checked_set,
     restricts_nothing,
 )
-from sparserob_core.control.sets.integrals import enclosed
+from sparserob_core.control.sets.integrals import can_enclose_integrals
 from sparserob_core.control.sets.sets import Equality, Product
 from sparserob_core.control.sets.strangers import require_consistent
 from sparserob_core.control.term import (
@@ -231,7 +231,7 @@ class OptimalControlProblem(Term):
             self._set_field("control_step", None if restricts_nothing(step) else step)
         self._check_disturbance()
         bound = self.measurable
-        if bound is not None and not enclosed(bound):
+        if bound is not None and not can_enclose_integrals(bound):
             raise InputError(
                 path="disturbance",
                 expected="a box, polytope, ellipsoid, ball or zonotope, or another set that states its `continued`,"
@@ -263,7 +263,7 @@ class OptimalControlProblem(Term):
     @property
     def measurable(self) -> ConvexSet | None:
         """The set of the measurable disturbances, 0 along the columns of others; ``None`` where there are none."""
-        return apart(self.disturbance, self.disturbance_class, "measurable")
+        return select_class(self.disturbance, self.disturbance_class, "measurable")
 
     @property
     def lists(self) -> dict[str, tuple[Window, ...]]:
@@ -527,7 +527,7 @@ class OptimalControlProblem(Term):
                 expected="none beside a list of disturbances, each of which has its own",
                 got=f"{self.disturbance_class}" if self.disturbance is None else self.disturbance.kind,
             )
-        system, bound, kind, breakpoints = joined(self.system, disturbances, self.horizon)
+        system, bound, kind, breakpoints = join_disturbances(self.system, disturbances, self.horizon)
         self._set_field("system", system)
         self._set_field("disturbance", bound)
         self._set_field("disturbance_class", kind)
@@ -565,7 +565,7 @@ class OptimalControlProblem(Term):
         if any(entry.name == RETURN for entry in self.windows):
             raise InputError(path="repeat", expected=f"no path constraint named {RETURN}, which is that of repeat")
         self._set_field("repeat", Repeating.IMPOSED)
-        path, ends = ending(self.initial_set, np.asarray(self.initial_state, dtype=float), self.horizon)
+        path, ends = require_return(self.initial_set, np.asarray(self.initial_state, dtype=float), self.horizon)
         self._set_field("path", (*self.path, *path))
         self._set_field("terminal", (*self.terminal, *ends))
 

@@ -84,7 +84,9 @@ class Symbol:
     __hash__ = None  # type: ignore[assignment]
 
 
-def traced(name: str, function: Callable[..., object], names: Sequence[str], probes: Array) -> list[list[str | float]]:
+def trace_entries(
+    name: str, function: Callable[..., object], names: Sequence[str], probes: Array
+) -> list[list[str | float]]:
     """Return the entries of a matrix that a function of the parameters returns, as numbers and expressions.
 
     Parameters

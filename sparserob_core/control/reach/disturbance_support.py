@@ -62,9 +62,9 @@ class LiftedSupport:
         most ``width^2 / 8`` of the largest second derivative, and mode by mode at most twice the total change. The
         latter bound serves fast modes, which have died away long before a cell is as short as they are.
 
-        Given are bounds ``sizes (k, r)`` of the second derivative at the start, from the blocks that have ended, norm
-        bounds ``ended_bounds (L + 1, q)`` of their effect until each breakpoint, and norm bounds ``drive (q,)`` of the
-        rate at which the block that lasts drives the coordinates.
+        Given are bounds ``sizes (k, r)`` of the second derivative at the start, from the blocks that have ended, and
+        norm bounds ``ended_bounds (L + 1, q)`` of their effect until each breakpoint. The norm bounds ``drive (q,)``
+        are of the rate at which the block that lasts drives the coordinates.
         """
         grid, comparison = self.lifted.grid, self.lifted.comparison
         _, slope_norms, curvature_norms, norms, squared = self._curvature_terms

@@ -30,7 +30,7 @@ from sparserob_core.control.reach.support import (
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response, unique_rows
 from sparserob_core.control.response.time_grid import TimeGrid
-from sparserob_core.control.sets.integrals import INTERVAL_HALVINGS, integrated
+from sparserob_core.control.sets.integrals import INTERVAL_HALVINGS, enclose_integrals
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -285,7 +285,7 @@ class MeasurableSupport:
         shares = within / np.diff(starts)[intervals]
         terms = terms * (shares[:, None] ** np.arange(ORDER + 1))[..., None]
         errors = shares * errors + np.where(times > 0.0, late, 0.0)
-        partial = integrated(self.bound, terms, within, accuracy) + errors[:, None] * [-1.0, 1.0]
+        partial = enclose_integrals(self.bound, terms, within, accuracy) + errors[:, None] * [-1.0, 1.0]
         return np.asarray(before + partial)
 
     def _look_up_tables(self, A: Array, E: Array, ages: Array, directions: Array, key: bytes) -> list[_IntegralTable]:
@@ -312,7 +312,9 @@ class MeasurableSupport:
             terms, errors, tallest = self._expand_rows(A, E, directions[first : first + chunk_size], starts)
             accuracy = ACCURACY * np.maximum(tallest * float(ages[-1]), TINY)
             intervals = np.tile(lengths, len(terms)), np.repeat(accuracy, lengths.size)
-            bounds = integrated(self.bound, terms.reshape(-1, *terms.shape[2:]), *intervals).reshape(*errors.shape, 2)
+            bounds = enclose_integrals(self.bound, terms.reshape(-1, *terms.shape[2:]), *intervals).reshape(
+                *errors.shape, 2
+            )
             bounds = bounds + errors[..., None] * [-1.0, 1.0]
             late = rounding(8) * horizon * tallest
             for number, interval_bounds in enumerate(bounds):

@@ -33,7 +33,12 @@ from sparserob_core.control.reach.varying_motion import (
 )
 from sparserob_core.control.response.response import Propagator, Response, unique_rows
 from sparserob_core.control.response.varying.expansion import Kernel
-from sparserob_core.control.sets.integrals import CUTS_PER_INTERVAL, INTERVAL_HALVINGS, absolute, integrated
+from sparserob_core.control.sets.integrals import (
+    CUTS_PER_INTERVAL,
+    INTERVAL_HALVINGS,
+    enclose_absolute_integrals,
+    enclose_integrals,
+)
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.expressions.rounding import rounding
@@ -276,7 +281,7 @@ class VaryingExecution(Execution):
         for j, share in enumerate(self.shares):
             members = np.flatnonzero(asked[j])
             accuracy = np.maximum(ACCURACY * self.motion.grid.pieces * sizes[members, j], TINY)
-            integrals = absolute(integrands.terms[members, :, j], accuracy)
+            integrals = enclose_absolute_integrals(integrands.terms[members, :, j], accuracy)
             integrals = integrals + errors[members, j, None] * [-1.0, 1.0]
             bounds[members, j] = share * np.maximum(integrals, 0.0) * [1.0 / OUTWARD, OUTWARD]
         return bounds
@@ -287,7 +292,7 @@ class VaryingExecution(Execution):
         terms = rounding(self.motion.states + 2 * order + INTERVAL_HALVINGS + 2 * m)
         errors = integrands.errors @ self.error_radii + terms * sizes
         accuracy = np.maximum(ACCURACY * self.motion.grid.pieces * sizes, TINY)
-        integrals = integrated(bound, integrands.terms, np.ones(count), accuracy)
+        integrals = enclose_integrals(bound, integrands.terms, np.ones(count), accuracy)
         return np.asarray(integrals + OUTWARD * errors[:, None] * [-1.0, 1.0])[:, None]
 
 

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.disturbances import Breakpoints, Classes, apart
+from sparserob_core.control.problem.disturbances import Breakpoints, Classes, select_class
 from sparserob_core.control.response.time_grid import TimeGrid
 from sparserob_core.control.sets.sets import NormBall, Polytope, product
 from sparserob_core.errors import InputError
@@ -56,14 +56,14 @@ class DisturbanceModel:
             return None
         if self.kind != "several":
             return self
-        held_set = apart(self.bound, self.classes, "piecewise_constant")
+        held_set = select_class(self.bound, self.classes, "piecewise_constant")
         assert held_set is not None
         return replace(self, kind="piecewise_constant", set=held_set, bound=held_set, classes=())
 
     @cached_property
     def measurable(self) -> ConvexSet | None:
         """Set of the measurable disturbances, ``None`` where there are none."""
-        return apart(self.bound, self.classes if self.kind == "several" else self.kind, "measurable")
+        return select_class(self.bound, self.classes if self.kind == "several" else self.kind, "measurable")
 
     @property
     def channels(self) -> int:

@@ -28,7 +28,7 @@ SECANT_STEPS = 10  # steps of the secant method; with half of them a part near a
 NEAR_END = 1e-9  # share of an interval next to its ends: an interval with a sign change there is halved
 
 
-def enclosed(bound: ConvexSet) -> bool:
+def can_enclose_integrals(bound: ConvexSet) -> bool:
     """Return True where integrals of the support function of a set can be enclosed.
 
     The set has to be flat, or its analytic continuation known.
@@ -115,7 +115,7 @@ def _build_substitution_matrix(count: int, share: float, begin: float) -> Array:
     return matrix
 
 
-def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) -> Array:
+def enclose_integrals(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) -> Array:
     """Return lower and upper bounds of the integrals of the support function of a set along polynomials.
 
     Parameters
@@ -153,7 +153,7 @@ def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) 
     return total
 
 
-def absolute(terms: Array, accuracy: Array) -> Array:
+def enclose_absolute_integrals(terms: Array, accuracy: Array) -> Array:
     """Return lower and upper bounds of the integrals over ``[0, 1]`` of the absolute values of polynomials.
 
     Intervals are divided where a polynomial changes its sign: both parts are then enclosed at once, where halves would

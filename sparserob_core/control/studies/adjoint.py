@@ -19,7 +19,7 @@ from scipy.linalg import matrix_balance
 from sparserob_core.control.enclosures.flows import products
 from sparserob_core.control.enclosures.matrix_exponential import exponential
 from sparserob_core.control.reach.measurable import ORDER
-from sparserob_core.control.sets.integrals import integrated
+from sparserob_core.control.sets.integrals import enclose_integrals
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.expressions.rounding import rounding
@@ -290,7 +290,7 @@ class WorstRow:
         powers = shares[:, None] ** np.arange(ORDER + 1)
         points = self.adjoint.coefficients[steps][:, :, self.disturbances.inputs] * powers[..., None]
         lengths = shares * self.adjoint.step
-        return integrated(self.disturbances.bound, points, lengths, np.full(lengths.size, self._accuracy))
+        return enclose_integrals(self.disturbances.bound, points, lengths, np.full(lengths.size, self._accuracy))
 
     @cached_property
     def _accuracy(self) -> float:

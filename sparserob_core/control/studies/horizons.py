@@ -75,7 +75,7 @@ class Multiplier:
         return self.limit + float(self.reference.along(times, self.direction[None]).max())
 
 
-def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControlProblem:
+def shorten_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControlProblem:
     """The problem with another, shorter ``horizon``: windows that lasted until the end do so still, those that would
     begin later are gone, as are the systems that would take their turn later. Raises `InputError` for a window that
     ends before the horizon of the problem."""
@@ -98,7 +98,7 @@ def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControl
     return shorter
 
 
-def stretched(dictionary: Dictionary, horizon: float) -> Dictionary:
+def stretch_dictionary(dictionary: Dictionary, horizon: float) -> Dictionary:
     """The dictionary with the same pieces as shares of another horizon."""
     shares = dictionary.breakpoints / dictionary.horizon
     breakpoints = horizon * shares
@@ -133,7 +133,7 @@ class Horizons:
                 "of: horizon: the control's dictionary has fewer functions than pieces; expected one that takes any"
                 " values on its pieces"
             )
-        at_horizon(self.problem, self.problem.horizon)
+        shorten_horizon(self.problem, self.problem.horizon)
         object.__setattr__(self, "control", self.control.merged())
 
     @property
@@ -214,7 +214,7 @@ class Horizons:
         acting = DisturbanceSupport(_replace_disturbance(lifted, slice(0, m)), self._control_model, rows)
         blocks = acting.blocks(at)[0, 0]
         if one.gain is not None:
-            ends = stretched(self.control, 1.0).breakpoints
+            ends = stretch_dictionary(self.control, 1.0).breakpoints
             blocks[0, np.searchsorted(ends, sum(one.piece) / 2) - 1] += one.gain * self._units.controls
         sizes += float(own.control.reach(blocks).sum())
         error += float(acting.neglected[0, piece])
@@ -242,7 +242,9 @@ class Horizons:
     @cached_property
     def _grid(self) -> TimeGrid:
         """The merged grid in the time ``s``, from 0 to 1."""
-        breakpoints = [stretched(dictionary, 1.0).breakpoints for dictionary in (self.control, self.disturbance)]
+        breakpoints = [
+            stretch_dictionary(dictionary, 1.0).breakpoints for dictionary in (self.control, self.disturbance)
+        ]
         forced = self._own_problem.system.forced
         return merge_grids(
             breakpoints[0], breakpoints[1], 0.0, None, forced.controls - self._own_problem.system.controls
@@ -256,7 +258,9 @@ class Horizons:
         if own.measurable is not None:  # what is constant on pieces is measurable
             starts = np.arange(self._grid.pieces)
             return DisturbanceModel("piecewise_constant", own.disturbance, own.disturbance, self._grid, starts=starts)
-        return disturbance_model(own.disturbance_class, own.disturbance, stretched(self.disturbance, 1.0), self._grid)
+        return disturbance_model(
+            own.disturbance_class, own.disturbance, stretch_dictionary(self.disturbance, 1.0), self._grid
+        )
 
     @cached_property
     def _control_model(self) -> DisturbanceModel:

@@ -19,7 +19,7 @@ from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.transcription.own_units import fixed
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.control.transcription.rounding import ROW_ROUNDING, added_up, rounded_down
+from sparserob_core.control.transcription.rounding import ROW_ROUNDING, added_up, reduce_bound
 from sparserob_core.control.transcription.transcribe import from_state
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
@@ -89,7 +89,7 @@ class InitialPlane:
         mu = np.zeros(self._equality_units.size)
         mu[np.flatnonzero(self._find_needed_equalities(z))[: result.dual.mu.size]] = result.dual.mu
         ends = replace(result, dual=replace(result.dual, mu=mu / self._equality_units))  # of the states that are fixed
-        bound = rounded_down(from_state(self.centred, self._build_initial_state(z)), ends, None).lower_bound
+        bound = reduce_bound(from_state(self.centred, self._build_initial_state(z)), ends, None).lower_bound
         return replace(result, lower_bound=bound)
 
     def weakened(self, result: Result) -> Result:

@@ -17,7 +17,7 @@ from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.studies.simulate import worst_errors
-from sparserob_core.control.transcription.terms.in_time import in_time
+from sparserob_core.control.transcription.terms.in_time import follow_in_time
 from sparserob_core.control.transcription.terms.superposed import at_corners
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
@@ -211,7 +211,7 @@ class ParametersInTime:
     def of(problem: OptimalControlProblem) -> ParametersInTime | None:
         """Return the parameters of a problem as the user gave it; ``None`` unless its system depends on the time and on
         parameters."""
-        corners, system = at_corners(problem), in_time(problem).system
+        corners, system = at_corners(problem), follow_in_time(problem).system
         if corners is None or system.dependence is None:
             return None
         return ParametersInTime(system.box, system.dependence, corners)

@@ -48,7 +48,7 @@ def fine_times(response: Response, parameters: ParameterIndex, more: Array) -> A
     return distinct_times(np.concatenate([inside, more, grid.breakpoints[-1:]]), float(grid.breakpoints[-1]))
 
 
-def finer(grid: TimeGrid, times: Array) -> TimeGrid:
+def refine_grid(grid: TimeGrid, times: Array) -> TimeGrid:
     """A grid on other times, ``(T,)`` from 0 to the horizon, that include the breakpoints; its inputs are given on the
     pieces of ``grid``."""
     return grid.refined(times)
@@ -193,7 +193,7 @@ class _TimeVaryingMotion:
         return np.asarray(_multiply(self.Phi[piece], state) + self.lengths[piece] * drive)
 
 
-def delivered(command: Array, errors: Array) -> Callable[[int, Array], Array]:
+def deliver_control(command: Array, errors: Array) -> Callable[[int, Array], Array]:
     """Return a function that gives `simulate_states` the delivered control: a ``command (m + constants, L)`` with
     ``errors (L, m, n)``, as shares of it, in ``n`` trajectories."""
 

@@ -168,16 +168,17 @@ def bound_row(
     notify: Notify = ignore,
     deadline: Deadline | None = None,
 ) -> BoundedRow:
-    """Enclose the worst case of a row at the control ``theta (m, N)``, to a ``tolerance`` relative to it, or to
-    `MIN_ROW_SHARE` of the largest value that the row has anywhere in its window, or of its unit where that is 0 but for
-    rounding. Dictionaries are those of control and disturbance."""
-    worst = followed(problem, dictionaries, theta, row)
+    """Enclose the worst case of a row at the control ``theta (m, N)``, to a ``tolerance`` relative to it.
+
+    At least `MIN_ROW_SHARE` of the largest value that the row has anywhere in its window counts as its size, or of its
+    unit where that is 0 but for rounding. Dictionaries are those of control and disturbance."""
+    worst = follow_row(problem, dictionaries, theta, row)
     if worst is not None:
         return _bound_known_row(worst, row, tolerance, notify, deadline)
     return _bound_by_program(problem, dictionaries, theta, row, tolerance, notify, deadline)
 
 
-def followed(
+def follow_row(
     problem: OptimalControlProblem, dictionaries: tuple[Dictionary, Dictionary], theta: Array, row: Row
 ) -> WorstRow | None:
     """The row by its adjoint; ``None`` where the system has parameters or pieces, or changes with time, or where

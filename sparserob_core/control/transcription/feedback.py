@@ -29,7 +29,7 @@ from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.reach.sizes import row_sizes
 from sparserob_core.control.response.inner_loop import InnerLoop
 from sparserob_core.control.transcription.own_units import added_up, constraint_sides, fixed, units_of_steps
-from sparserob_core.control.transcription.program import EQUALS, ranges, transcribed
+from sparserob_core.control.transcription.program import EQUALS, build_program, ranges
 from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import Acting, Feedback, Posed, ProgramPart, Transcription
 from sparserob_core.control.transcription.telling import Telling
@@ -99,7 +99,7 @@ class FeedbackModel(Acting):
     def from_state(self, model: Transcription, posed: Posed) -> Transcription:
         """Return the program of the same problem from another initial state; it shares the record of the measurements,
         and the explanations of the families, with the program of ``model``."""
-        transcription = transcribed(posed, self)
+        transcription = build_program(posed, self)
         named = {family.name: family for family in model.program.families}
         families = [
             replace(
@@ -198,12 +198,12 @@ class FeedbackModel(Acting):
             effort = FeedbackEffort(EFFORT, loop, prices, first)
             families.append(effort.family())
             settle_functions.append(effort.settled)
-            guide = (transcribed(posed, peak).program, first)
+            guide = (build_program(posed, peak).program, first)
             weights = np.append(np.zeros(first), 1.0)
             largest = float(prices @ magnitudes)
             lower, upper = np.append(lower, 0.0), np.append(upper, 2.0 * largest)
         elif charge.among == "peak" and problem.cost.is_linear:
-            among = (transcribed(posed, peak).program, first)
+            among = (build_program(posed, peak).program, first)
         return ProgramPart(
             families=[
                 replace(family, hindrance=lambda low, high: "" if loop.inner.acts else hindrance(system, horizon))

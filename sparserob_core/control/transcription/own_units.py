@@ -47,7 +47,7 @@ def rough_units(problem: OptimalControlProblem) -> Units:
         disturbances = power_of_two(extent(bound))
     index = ParameterIndex(system.parameters)
     parameters = np.ones(0) if system.parameters is None else power_of_two(_measure_widths(system.parameters))
-    matrices = [mode.matrices(looked_at(index)) for mode in system.forced.modes]
+    matrices = [mode.matrices(sampled_parameters(index)) for mode in system.forced.modes]
     A, B, E = _find_largest_entries(matrices)
     # a fast system is coupled through for a time of about 1/norm only; the eigenvalues do not depend on the units
     # (LAPACK balances)
@@ -209,7 +209,7 @@ def reaches(
     it is computed.
 
     The largest values are taken over the control's set, the worst disturbance, the worst initial state and the
-    parameters of `looked_at`.
+    parameters of `sampled_parameters`.
 
     Parameters
     ----------
@@ -235,7 +235,7 @@ def reaches(
     added : array (r,)
         The largest sums of absolute values.
     """
-    points, r = looked_at(parameters), H.shape[0]
+    points, r = sampled_parameters(parameters), H.shape[0]
     shape = (points.shape[0], r, times.size)
     at, p = np.tile(times, shape[0] * r), np.repeat(points, r * times.size, axis=0)
     directions = np.tile(np.repeat(H, times.size, axis=0), (shape[0], 1))
@@ -278,7 +278,7 @@ def _estimate_uncontrolled_reach(functionals: WorstFunctionals, parameters: Para
     not act."""
     response, time = functionals.response, float(functionals.response.grid.breakpoints[-1])
     system = response.system
-    A, B, E = _find_largest_entries([mode.matrices(looked_at(parameters)) for mode in system.forced.modes])
+    A, B, E = _find_largest_entries([mode.matrices(sampled_parameters(parameters)) for mode in system.forced.modes])
     distances = np.abs(response.initial_state) + time * B[:, system.controls :].sum(axis=1)
     if functionals.initial is not None:
         distances = distances + extent(functionals.initial)
@@ -312,7 +312,7 @@ def added_up(problem: OptimalControlProblem, functionals: WorstFunctionals) -> A
     return sums
 
 
-def looked_at(parameters: ParameterIndex) -> Array:
+def sampled_parameters(parameters: ParameterIndex) -> Array:
     """Return a middle parameter, and support points along the axes and the diagonal, ``(v, nu)``."""
     if parameters.set is None:
         return np.zeros((1, 0))

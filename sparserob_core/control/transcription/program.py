@@ -33,7 +33,7 @@ from sparserob_core.control.transcription.own_units import (
 )
 from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import Acting, Posed, ProgramPart, RowUnits, Transcription
-from sparserob_core.control.transcription.steps import Steps, paired
+from sparserob_core.control.transcription.steps import Steps, pair_sides
 from sparserob_core.control.transcription.telling import Telling
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -108,7 +108,7 @@ class OpenLoopModel(Acting):
         return np.zeros(0)
 
 
-def transcribed(posed: Posed, acting: Acting) -> Transcription:
+def build_program(posed: Posed, acting: Acting) -> Transcription:
     """Return the program of a posed problem, without a twin. It has the nominal entries with their cost, bounds and
     equalities, and the part that depends on how the control is ``acting``."""
     problem, control, functionals, acting_part = posed.problem, posed.control, posed.functionals, acting.part(posed)
@@ -190,7 +190,7 @@ def compute_conversion_factors(theirs: Posed, own: Transcription, units: Units) 
     ``(k,)``, and for every equality ``(e,)``."""
     rows, pieces, controls = own.rows, own.control.pieces, units.controls
     assert rows is not None
-    slants, slanting = (slanted(posed.held.control)[0] for posed in (theirs, own))
+    slants, slanting = (slanted_sides(posed.held.control)[0] for posed in (theirs, own))
     sides = ratios(slants, slanting / rows.sides[:, None], controls)
     steps, own_steps = (Steps.of(posed.held, posed.control) for posed in (theirs, own))
     changes = np.repeat(ratios(steps.H, own_steps.divided(rows.steps).H, controls), steps.times.size)
@@ -210,7 +210,7 @@ def held_units(posed: Posed, ranged: ConvexSet) -> RowUnits:
         np.abs(_build_equalities(posed.held, posed.functionals, posed.parameters)[0]).max(axis=1, initial=0.0)
         > NEGLIGIBLE_ROW_ENTRY * sums
     )
-    H, h = slanted(ranged)
+    H, h = slanted_sides(ranged)
     sides = units_of_sides(H, h, ranged.reach(H), np.abs(H) @ extent(ranged)) if h.size else h
     ends = power_of_two(np.where(is_controlled, 1.0, LEAST_UNIT_SHARE) * sums)
     return RowUnits(sides, _step_units(posed.held, ranged), ends, is_controlled)
@@ -218,7 +218,7 @@ def held_units(posed: Posed, ranged: ConvexSet) -> RowUnits:
 
 def _step_units(problem: OptimalControlProblem, ranged: ConvexSet) -> Array:
     """Return the unit ``(r,)`` of every row of the control's steps: the smaller one of the units of its two sides."""
-    H, lower, upper = paired(problem.control_step, problem.system.controls)
+    H, lower, upper = pair_sides(problem.control_step, problem.system.controls)
     if problem.control_step is None or not upper.size:
         return upper
     both, heights = np.vstack([H, -H]), np.concatenate([upper, -lower])
@@ -241,7 +241,7 @@ def _build_image(
     bound, channels = problem.control, problem.system.controls
     lower, upper = (np.repeat(ends, dictionary.pieces) for ends in ranges(bound))
     values = csc_array(dictionary.sparse.T)
-    H, h = slanted(bound)
+    H, h = slanted_sides(bound)
     H, h = (H, h) if rows is None else (H / rows.sides[:, None], h / rows.sides)
     steps = Steps.of(problem, dictionary)
     steps = steps if rows is None else steps.divided(rows.steps)
@@ -287,7 +287,7 @@ def ranges(bound: ConvexSet) -> tuple[Array, Array]:
     return -bound.support(-axes), bound.support(axes)
 
 
-def slanted(bound: ConvexSet) -> tuple[Array, Array]:
+def slanted_sides(bound: ConvexSet) -> tuple[Array, Array]:
     """Return the sides ``(H (r, m), h (r,))`` of a set of controls that bound several controls together; none for a box
     or a curved set."""
     flat = bound.halfspaces()

@@ -14,7 +14,7 @@ from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.strangers import strangers
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.terms.in_time import within_reach
-from sparserob_core.control.transcription.terms.superposed import superposed
+from sparserob_core.control.transcription.terms.superposed import parameters_as_states
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.expressions.taylor import TaylorSpace
 from sparserob_core.sip.result import Result
@@ -30,7 +30,7 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
 
     Nothing is solved: this takes milliseconds.
     """
-    problem = superposed(problem)  # parameters beside the time are no obstacle
+    problem = parameters_as_states(problem)  # parameters beside the time are no obstacle
     if problem.measurable is not None and problem.system.parameter_count:
         paths = [entry.set for entry in problem.windows]
         is_out_of_reach = not problem.system.varies
@@ -56,7 +56,7 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
     return None
 
 
-def announced(why: str, limited: bool) -> str:
+def announce(why: str, limited: bool) -> str:
     """Return the message at the beginning of a run that cannot end with a certificate."""
     ends = (
         ""
@@ -66,14 +66,14 @@ def announced(why: str, limited: bool) -> str:
     return f"{why}{ends}"
 
 
-def remarked(model: Transcription, result: Result) -> Result:
+def add_assumptions(model: Transcription, result: Result) -> Result:
     """Return the same result with what its reader has to know beside it.
 
     A claim gets its unproven assumptions, and what rounding does to a control in open loop. A result without a claim
     gets the property of the plant that may be the reason. Nothing is added twice.
     """
     if result.status in ("certified", "verified"):
-        remarks = [remark(model.problem), *promised(model)]
+        remarks = [unproven_assumptions(model.problem), *promised(model)]
     else:
         advice = hindrance(model.problem.system, model.problem.horizon)
         remarks = [] if result.status == "infeasible" or advice in result.message else [advice]
@@ -81,7 +81,7 @@ def remarked(model: Transcription, result: Result) -> Result:
     return replace(result, message="; ".join([result.message, *added])) if added else result
 
 
-def remark(problem: OptimalControlProblem) -> str:
+def unproven_assumptions(problem: OptimalControlProblem) -> str:
     """Return the unproven assumptions of a claim about a problem; empty where there are none. They are the properties
     that sets of plugins state of themselves."""
     kinds = sorted({convex.kind for convex in strangers(problem)})

@@ -13,7 +13,7 @@ import numpy as np
 from sparserob_core.control.enclosures.decoupling import pace
 from sparserob_core.control.response.inner_loop import Weights
 from sparserob_core.control.transcription.own_units import extent, fixed
-from sparserob_core.control.transcription.program import slanted
+from sparserob_core.control.transcription.program import slanted_sides
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.sip.convex_set import Array
@@ -26,7 +26,7 @@ INTEGRATED = 8.0  # weight of integrals of absolute values: enclosures of them a
 SMALL_GAP = 1e-11  # excess of the gap over its tolerance, after the reduction, that leaves a result certified
 
 
-def rounded_down(model: Transcription, result: Result, tolerance: float | None, prices: Array | None = None) -> Result:
+def reduce_bound(model: Transcription, result: Result, tolerance: float | None, prices: Array | None = None) -> Result:
     """Return the same result with its lower bound reduced by an allowance for rounding. The result is no longer
     ``certified`` where this opens the gap beyond the relative ``tolerance``. A bound of at most 0 is left as it is.
 
@@ -75,7 +75,7 @@ def _estimate_transition_error(model: Transcription) -> float:
 
 def _sum_row_magnitudes(model: Transcription, result: Result, share: float, prices: Array | None) -> float:
     """Return the sum over all rows with a multiplier of the multiplier times the absolute numbers that are added up to
-    the row. A ``share`` of this sum may be lost by rounding; ``prices`` as in `rounded_down`."""
+    the row. A ``share`` of this sum may be lost by rounding; ``prices`` as in `reduce_bound`."""
     middle = model.parameters.middle
     rows, extra, uses_prices = [], 0.0, prices is not None
     for cut, explanation in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
@@ -229,7 +229,7 @@ def _bound_sign_error(model: Transcription, result: Result) -> float:
     """
     if result.dual.z is None:
         return 0.0
-    (H, h), bound = slanted(model.problem.control), model.problem.control
+    (H, h), bound = slanted_sides(model.problem.control), model.problem.control
     controls, pieces = model.problem.system.controls, model.control.pieces
     sides, remaining = np.split(result.dual.z[controls * pieces :], [h.size * pieces])
     error = float(np.maximum(-sides, 0.0).reshape(h.size, pieces).sum(axis=1) @ np.maximum(bound.support(-H), 0.0))

@@ -43,7 +43,7 @@ class Steps:
     @staticmethod
     def of(problem: OptimalControlProblem, dictionary: Dictionary) -> Steps:
         """Return the steps of a problem; without rows where its steps are free, or where their set is curved."""
-        H, lower, upper = paired(problem.control_step, problem.system.controls)
+        H, lower, upper = pair_sides(problem.control_step, problem.system.controls)
         return Steps(H, lower, upper, dictionary, before(problem), seam(problem, dictionary))
 
     def divided(self, units: Array) -> Steps:
@@ -90,7 +90,7 @@ def seam(problem: OptimalControlProblem, dictionary: Dictionary) -> bool:
     return bool(problem.repeat) and dictionary.pieces > 1
 
 
-def paired(convex: ConvexSet | None, dimension: int) -> tuple[Array, Array, Array]:
+def pair_sides(convex: ConvexSet | None, dimension: int) -> tuple[Array, Array, Array]:
     """Return ``H``, ``lower`` and ``upper`` of ``lower <= H x <= upper`` for a set with flat sides, opposite sides in
     one row. The arrays have no rows for ``None`` and for a curved set."""
     flat = None if convex is None else convex.halfspaces()

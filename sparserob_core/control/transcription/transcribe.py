@@ -32,14 +32,14 @@ from sparserob_core.control.transcription.own_units import (
 )
 from sparserob_core.control.transcription.program import (
     OpenLoopModel,
+    build_program,
     compute_conversion_factors,
     held_nominally,
     held_units,
-    transcribed,
 )
 from sparserob_core.control.transcription.record import Acting, Posed, Transcription
 from sparserob_core.control.transcription.steps import refuse_without_steps
-from sparserob_core.control.transcription.terms.accumulated import accumulated
+from sparserob_core.control.transcription.terms.accumulated import integrals_as_states
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import OwnUnits, SemiInfiniteProgram
@@ -116,7 +116,7 @@ def prepare(
             )
     require_representable(problem)
     user_problem, disturbance = _merge_disturbance_grids(problem, disturbance)
-    problem = accumulated(user_problem)
+    problem = integrals_as_states(user_problem)
     refuse_without_steps(problem, control)
     mask = answers_of(policy, control.breakpoints, problem.measurements)
     if problem.execution is not None and mask.any():
@@ -139,7 +139,7 @@ def prepare(
     acting: Acting = OpenLoopModel(formulation)
     if policy is not None and mask.any():
         acting = feedback.answering(policy, mask, posed, *own())
-    model = transcribed(posed, acting)
+    model = build_program(posed, acting)
     return replace(model, program=model.program.mirrored(lambda _: _build_own_units(model, *own())), given=user_problem)
 
 
@@ -280,7 +280,7 @@ def in_own_units(model: Transcription, wide: bool = False) -> tuple[Transcriptio
 def _transcribe_in_own_units(model: Transcription, posed: Posed, units: Units) -> tuple[Transcription, Units]:
     """Return the transcription of a problem that is ``posed`` in its own units, with families that are explained in the
     user's units, and these own units."""
-    own = transcribed(posed, model.acting.in_own(model, posed, units))
+    own = build_program(posed, model.acting.in_own(model, posed, units))
     telling = own.acting.telling(own, units)
     families = [
         telling.family(family, theirs)
@@ -297,7 +297,7 @@ def like(own: Transcription, problem: OptimalControlProblem) -> SemiInfiniteProg
     constraints = tuple(
         constraint.divided(_compute_row_ratios(constraint, own_constraint)) for constraint, own_constraint in pairs
     )
-    program = transcribed(replace(posed, constraints=constraints, rows=own.rows), own.acting).program
+    program = build_program(replace(posed, constraints=constraints, rows=own.rows), own.acting).program
     families = [
         replace(family, explain=own_family.explain, row_units=own_family.row_units, index_units=own_family.index_units)
         for family, own_family in zip(program.families, own.program.families, strict=True)

@@ -13,7 +13,7 @@ from sparserob_core.control.policies.policy import answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.suprema import bound_rows
-from sparserob_core.control.transcription.terms.accumulated import accumulated
+from sparserob_core.control.transcription.terms.accumulated import integrals_as_states
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import build, control_problem_of, dictionaries_of, name_of
 from sparserob_core.experiment.bound.record import Bound, WorstCase, summary_of_bound, worst_case
@@ -86,7 +86,7 @@ def bound(
     loaded = load_config(as_config(config), overrides)
     problem = control_problem_of(loaded, "config: expected a control problem, whose rows have worst cases")
     dictionaries = dictionaries_of(loaded, problem.horizon)
-    problem, shape = accumulated(problem), (problem.system.controls, dictionaries[0].functions)
+    problem, shape = integrals_as_states(problem), (problem.system.controls, dictionaries[0].functions)
     if control is not None:
         _require_matching_control(control, shape, loaded, _has_answering_policy(loaded, problem, dictionaries[0]))
     deadline = Deadline(loaded.config.limits.seconds if seconds is None else float(seconds))

@@ -43,9 +43,9 @@ def compare(
     where all runs search. Where matplotlib is missing there is no picture, and the remarks say so. ``observers`` are
     shown the runs, as the points of a study that is over.
 
-    Raises `InputError` when one of them is no run directory and no study, when runs are not all of one problem on the
-    same dictionaries, when studies are not finished or have one contender only, when there is nothing to draw, when
-    the picture cannot be written, and when there are observers of studies.
+    Raises `InputError` when one of them is no run directory and no study, and when runs are not all of one problem on
+    the same dictionaries. So it does when studies are not finished or have one contender only, and when there are
+    observers of studies. The last reasons are that there is nothing to draw, and that the picture cannot be written.
     """
     if isinstance(runs, str | Path) or not runs:
         raise InputError(f"runs: expected a list of at least one run directory, got {runs!r}")

@@ -9,7 +9,13 @@ import numpy as np
 
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.adversary import Adversary, find_adversaries
-from sparserob_core.control.studies.simulate import delivered, fine_times, finer, simulate_states, worst_errors
+from sparserob_core.control.studies.simulate import (
+    deliver_control,
+    fine_times,
+    refine_grid,
+    simulate_states,
+    worst_errors,
+)
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import Experiment
@@ -82,18 +88,18 @@ def propagated(model: Transcription, theta: Array, arrays: Mapping[str, Array]) 
     breakpoints = arrays["breakpoints"]
     grid = response.grid.refined(breakpoints)
     times = fine_times(Response(response.system, grid, response.initial_state), model.parameters, arrays["times"])
-    fine_response = Response(response.system, finer(grid, times), response.initial_state)
+    fine_response = Response(response.system, refine_grid(grid, times), response.initial_state)
     disturbances = arrays["disturbances"] if arrays["disturbances"].shape[1] else None
     noises = arrays["noises"].transpose(1, 2, 0) if "noises" in arrays else None
     acting, initial_states = controlled(model, theta, grid.control_piece, noises), arrays["initial_states"]
     execution = model.functionals.execution
     if execution is not None and not callable(acting):
-        fine_grid = finer(grid, times)  # an error of execution may change its sign within a piece
+        fine_grid = refine_grid(grid, times)  # an error of execution may change its sign within a piece
         command = acting[:, fine_grid.control_piece]
         inner_response = Response(response.system, fine_grid, response.initial_state)
-        fine_response = Response(response.system, finer(fine_grid, times), response.initial_state)
+        fine_response = Response(response.system, refine_grid(fine_grid, times), response.initial_state)
         worst_cases = (arrays["times"], arrays["directions"], arrays["parameters"])
-        acting = delivered(command, worst_errors(inner_response, execution, command, worst_cases))
+        acting = deliver_control(command, worst_errors(inner_response, execution, command, worst_cases))
         disturbances = None if disturbances is None else disturbances[:, :, fine_grid.disturbance_piece]
     states = np.stack(list(simulate_states(fine_response, acting, arrays["parameters"], disturbances, initial_states)))
     return times, np.ascontiguousarray(states.transpose(2, 1, 0))

@@ -12,7 +12,7 @@ from sparserob_core.control.constraints.explanation import TimedExplanation, in_
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.studies.answer import ControlResult
-from sparserob_core.control.transcription.program import slanted
+from sparserob_core.control.transcription.program import slanted_sides
 from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, PlainExperiment
 from sparserob_core.sip.convex_set import Array
@@ -315,7 +315,7 @@ def _sum_piece_multipliers(problem: OptimalControlProblem, z: Array | None, piec
     added."""
     if z is None:
         return None
-    m, (sides, _) = problem.system.controls, slanted(problem.control)
+    m, (sides, _) = problem.system.controls, slanted_sides(problem.control)
     rows = z[: (m + sides.shape[0]) * pieces].reshape(-1, pieces)
     answer: Array = rows[:m] + sides.T @ rows[m:]
     return answer

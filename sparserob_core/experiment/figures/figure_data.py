@@ -84,19 +84,19 @@ class FigureData:
     ``times (T,)`` with the nominal ``state (d, T)`` and the worst case ``tube_lower``, ``tube_upper`` ``(d, T)`` over
     every disturbance and parameter, rows of NaN for states that nobody asked for; ``walls`` the path and terminal
     constraints on single components; ``active`` the imposed constraints that carry a multiplier;
-    ``history`` the rounds of the method. ``tolerance`` is the relative gap that was asked for, ``cost_scale`` what is
-    added up to the cost, ``cost_of`` what is added up to it, where that is not the L1 norm alone, ``cost_unit``
-    what it is measured in, where that is known, ``counts`` whether cost means the time that the control acts, ``names``
-    what everything is called, ``plane`` where the system moves, if the problem says that it does so in one,
-    ``switching (m, K)`` the switching function, the effect of the constraints on the control, where that is known.
+    ``history`` the rounds of the method. ``tolerance`` is the relative gap that was asked for, and ``cost_scale`` the
+    sum of the terms of the cost. ``cost_of`` names these terms where they are not the L1 norm alone, ``cost_unit``
+    their unit where it is known, and ``counts`` says whether cost means the time that the control acts. ``names`` are
+    those of states, controls and disturbances, and ``plane`` is the plane in which the system moves, if the problem
+    names one. ``switching (m, K)`` is the switching function, the effect of the constraints on the control, where
+    known.
 
-    Under feedback the control is the nominal one, ``control_least``, ``control_most (m, K)`` are how far the
-    disturbance moves it, ``gains (K, K, m, p)`` answer what is measured, ``outputs`` or (``None``) states, and
-    ``alone_lower``, ``alone_upper (d, T)`` is the tube that ``alone`` has, which is
-    the nominal control or an inner loop. ``effort (3, m, K)`` are
-    quantiles of ``|u|`` over ``draws`` admissible disturbances (5 %, 50 %, 95 %), and ``answers (K, K, m)`` what the
-    control on every piece adds for the innovation of every breakpoint in the ``worst_case`` that is named; each where
-    it was asked for.
+    Under feedback the control is the nominal one, and ``control_least``, ``control_most (m, K)`` are how far the
+    disturbance moves it. ``gains (K, K, m, p)`` answer the measured ``outputs``, or states where these are ``None``.
+    ``alone_lower``, ``alone_upper (d, T)`` is the tube of ``alone``, which is the nominal control or an inner loop.
+    ``effort (3, m, K)`` are quantiles of ``|u|`` over ``draws`` admissible disturbances (5 %, 50 %, 95 %), and
+    ``answers (K, K, m)`` what the control on every piece adds for the innovation of every breakpoint in the
+    ``worst_case`` that is named; each where it was asked for.
     """
 
     title: str

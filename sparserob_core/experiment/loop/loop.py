@@ -14,10 +14,10 @@ import numpy as np
 from sparserob_core.arguments import whole
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.loop.controller import Controller
-from sparserob_core.control.problem.names import joined
+from sparserob_core.control.problem.names import join_units
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.laws import LawName, ParametersInTime, Uncertainty, noises
-from sparserob_core.control.studies.simulate import fine_times, finer, simulate_states
+from sparserob_core.control.studies.simulate import fine_times, refine_grid, simulate_states
 from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
@@ -160,7 +160,7 @@ def _simulate_loops(
             else partial(parameters_in_time.at, rows=parameter_rows)
         )
         law_grid = grid if law == ADVERSARY else model.response.grid
-        fine = Response(model.response.system, finer(law_grid, times), model.response.initial_state)
+        fine = Response(model.response.system, refine_grid(law_grid, times), model.response.initial_state)
         laws[law] = laws.get(law, 0) + 1
         acting.reset()
         costs, previous_control = list[float](), np.zeros((0, model.problem.system.controls))
@@ -213,9 +213,11 @@ def _simulate_loops(
         cost_unit=str((finished.summary.get("units") or {}).get("cost") or ""),
         paid_in=model.problem.cost_unit,
         units={
-            **{constraint.name: joined(constraint.measured).strip() for constraint in model.constraints},
-            CONTROL: joined(model.problem.names.control_units).strip() if model.problem.control.halfspaces() else "",
-            STEP: joined(model.problem.names.control_units).strip() if model.problem.control.halfspaces() else "",
+            **{constraint.name: join_units(constraint.measured).strip() for constraint in model.constraints},
+            CONTROL: join_units(model.problem.names.control_units).strip()
+            if model.problem.control.halfspaces()
+            else "",
+            STEP: join_units(model.problem.names.control_units).strip() if model.problem.control.halfspaces() else "",
         },
     )
 

@@ -20,7 +20,7 @@ from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.parametric import ParametricProgram, extreme_program, slack_program
-from sparserob_core.sip.working.ledger import unproven
+from sparserob_core.sip.working.ledger import prove_nothing
 from sparserob_core.sip.working.scaled import largest_factor, least_slack
 
 SLACK_BOUND = 1e3  # bounds of the slack, in units of the violation without control
@@ -174,7 +174,7 @@ def _compute_slack(programs: ParametricProgram, factor: float, tools: Tools) -> 
             return least_slack(program, tools)
         bounds = _bound_slack(program)
         result = Exchange(tolerance=1e-9).close(
-            slack_program(program, *bounds), replace(tools, regulariser=None), unproven
+            slack_program(program, *bounds), replace(tools, regulariser=None), prove_nothing
         )
     except InputError:
         if factor in (0.0, 1.0):

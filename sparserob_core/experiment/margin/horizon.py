@@ -12,7 +12,7 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import in_numbers
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.studies.horizons import Horizons, Multiplier, at_horizon, stretched
+from sparserob_core.control.studies.horizons import Horizons, Multiplier, shorten_horizon, stretch_dictionary
 from sparserob_core.control.transcription.own_units import fixed
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
@@ -234,8 +234,10 @@ class HorizonSearch:
     ) -> tuple[Transcription, Result]:
         from sparserob_core.control.transcription.transcribe import prepare
 
-        control, disturbance = (stretched(dictionary, horizon) for dictionary in (self.control, self.disturbance))
-        model = prepare(at_horizon(problem, horizon), control, disturbance)
+        control, disturbance = (
+            stretch_dictionary(dictionary, horizon) for dictionary in (self.control, self.disturbance)
+        )
+        model = prepare(shorten_horizon(problem, horizon), control, disturbance)
         return model, solve_in_own_units(self.method, model.program, replace(self.tools, notify=notify))
 
 

@@ -196,7 +196,7 @@ def _format_interval(lower: float, upper: float) -> str:
 def _build_search(
     loaded: Loaded, tools: Tools, of: str, tolerance: float, notify: Notify
 ) -> MarginSearch | HorizonSearch:
-    from sparserob_core.control.transcription.terms.accumulated import accumulated
+    from sparserob_core.control.transcription.terms.accumulated import integrals_as_states
     from sparserob_core.control.transcription.transcribe import in_own_units, like, prepare, transcribe
 
     experiment = assemble(loaded, tools.deadline).of_control(
@@ -216,7 +216,7 @@ def _build_search(
     joined: ParametricProgram | None = None
     if chosen.affine and policy is None:  # one program for all factors, in the units of the factor 1
         own, units = in_own_units(prepare(chosen.at(1.0), control, disturbance))
-        joined = ParametricProgram(lambda factor: like(own, units.of_problem(accumulated(chosen.at(factor)))))
+        joined = ParametricProgram(lambda factor: like(own, units.of_problem(integrals_as_states(chosen.at(factor)))))
     width = tolerance * (1.0 if chosen.relative else chosen.highest)
     search = MarginSearch(
         experiment.title, programs, joined, chosen, _choose_method(loaded), tools, width, Points(of, notify)

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias, final
 
 import numpy as np
 
-from sparserob_core.control.problem.names import joined
+from sparserob_core.control.problem.names import join_units
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.errors import InputError
@@ -114,15 +114,15 @@ def scaling(
 def _add_units(chosen: Scaling, problem: OptimalControlProblem) -> Scaling:
     """Return a scaling with the unit of its quantity, where the problem names a single one for it."""
     names = problem.names
-    of_states = joined(set(names.state_units)) if len(set(names.state_units)) == 1 else ""
+    of_states = join_units(set(names.state_units)) if len(set(names.state_units)) == 1 else ""
     unit = {
-        "disturbance": joined(names.disturbance_units),
+        "disturbance": join_units(names.disturbance_units),
         "parameters": "",
-        "control": joined(names.control_units),
-        "control_step": joined(names.control_units),
+        "control": join_units(names.control_units),
+        "control_step": join_units(names.control_units),
         "execution": "",
         **dict.fromkeys(problem.sums, ""),
-    }.get(chosen.of.split(".")[0], chosen.unit or of_states if chosen.relative else joined([names.time])).strip()
+    }.get(chosen.of.split(".")[0], chosen.unit or of_states if chosen.relative else join_units([names.time])).strip()
     label = chosen.label.replace("[unit of time]", f"[{unit}]") if unit else chosen.label
     quantity = f"{chosen.quantity} [{unit}]" if unit else chosen.quantity
     return replace(chosen, label=label, quantity=quantity, cost_unit=problem.cost_unit)

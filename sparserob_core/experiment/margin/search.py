@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias, final
 import numpy as np
 
 from sparserob_core.brief import brief
-from sparserob_core.control.loop.resolving import shifted
+from sparserob_core.control.loop.resolving import shift_cuts
 from sparserob_core.control.studies.causal import Ended
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.margin.critical import Critical, critical_factor
@@ -312,13 +312,13 @@ class MarginSearch:
             return False
         program = self.programs.program(factor)
         program = program if program.own_units is None else program.own_units.program
-        rows = rows_of(program, shifted(self.cuts, 0.0, program))
+        rows = rows_of(program, shift_cuts(self.cuts, 0.0, program))
         relaxed = RelaxedProgram(program, self.tools.solver, deadline=self.tools.deadline)
         return relaxed.solve(rows, 0.0).status == "infeasible"
 
     def _solve_from_cuts(self, initial_cuts: Sequence[Cut], program: SemiInfiniteProgram, tools: Tools) -> Result:
         """Return the result of a program in its own units, whose run begins with the constraints ``initial_cuts``."""
-        return self.method.close(program, tools, prover_of(program, tools), shifted(initial_cuts, 0.0, program))
+        return self.method.close(program, tools, prover_of(program, tools), shift_cuts(initial_cuts, 0.0, program))
 
     def run(self, factor: float, initial_cuts: Sequence[Cut] = ()) -> MarginPoint:
         """Run the problem at a factor, unless that was done before.

@@ -38,7 +38,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.proof.verdict import remarked
+from sparserob_core.sip.proof.verdict import add_warning
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.solver import Named
 
@@ -273,10 +273,10 @@ def concluded(experiment: Experiment, result: Result, tools: Tools, notify: Noti
     Returns
     -------
     Result
-        For a control problem a `SolvedProblem`; for another program the result as `remarked` returns it.
+        For a control problem a `SolvedProblem`; for another program the result as `add_warning` returns it.
     """
     if not isinstance(experiment, ControlExperiment):
-        return remarked(experiment.program, result)
+        return add_warning(experiment.program, result)
     attempt = tools.deadline.attempt
     notify(StudyProgress(text="certificate: what the multipliers prove without rounding", phase=True, result=result))
     if result.sparsest is None:

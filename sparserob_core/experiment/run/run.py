@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sparserob_core.control.transcription.provable import UNPROVABLE_SECONDS, announced, unprovable
+from sparserob_core.control.transcription.provable import UNPROVABLE_SECONDS, announce, unprovable
 from sparserob_core.errors import InputError, SparseRobError, named
 from sparserob_core.experiment.assemble import Anew, UntranscribedExperiment, assemble_in_time, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
@@ -133,7 +133,7 @@ def _run(
     if why is not None:
         deadline, why = (
             (deadline if deadline.bounded else Deadline(UNPROVABLE_SECONDS)),
-            announced(why, deadline.bounded),
+            announce(why, deadline.bounded),
         )
     tools = replace(tools, deadline=deadline)
     watching = [*_build_observers(loaded), *((type(observer).__name__, observer) for observer in observers)]

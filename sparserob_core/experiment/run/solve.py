@@ -24,7 +24,7 @@ from sparserob_core.sip.maximiser import Maximiser
 from sparserob_core.sip.method import GAP_TOLERANCE, Continuation, Method, Tools, require_suited
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.proof.verdict import remarked as remarked_program
+from sparserob_core.sip.proof.verdict import add_warning as remarked_program
 from sparserob_core.sip.relaxed.relaxed import require_separable
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.solver import AUTO, Auto, Solver
@@ -175,12 +175,12 @@ def solve(
     result = solve_in_own_units(chosen, program, tools).accounted(tools.solver)
     if isinstance(model, SemiInfiniteProgram):
         return remarked_program(model, result)
-    from sparserob_core.control.transcription.provable import remarked
+    from sparserob_core.control.transcription.provable import add_assumptions
     from sparserob_core.experiment.run.conclusion.final_states import with_final_states
     from sparserob_core.experiment.run.outcome import SolveArguments, SolvedProblem
 
     result = with_final_states(model, result, getattr(chosen, "tolerance", None))
-    result = remarked(model, result)
+    result = add_assumptions(model, result)
     arguments = SolveArguments(
         problem=model.stated,
         choices={
@@ -213,12 +213,12 @@ def _warn_unprovable(problem: OptimalControlProblem, deadline: Deadline) -> Dead
 
     Returns the deadline, which is then bounded, so that the search for a witness ends.
     """
-    from sparserob_core.control.transcription.provable import UNPROVABLE_SECONDS, announced, unprovable
+    from sparserob_core.control.transcription.provable import UNPROVABLE_SECONDS, announce, unprovable
 
     reason = unprovable(problem)
     if reason is None:
         return deadline
-    logger.warning("no control of this problem can be certified: %s", announced(reason, deadline.bounded))
+    logger.warning("no control of this problem can be certified: %s", announce(reason, deadline.bounded))
     return deadline if deadline.bounded else Deadline(UNPROVABLE_SECONDS)
 
 

@@ -12,13 +12,13 @@ import numpy as np
 
 from sparserob_core.arguments import whole
 from sparserob_core.control.constraints.state import StateConstraint
-from sparserob_core.control.problem.names import joined
+from sparserob_core.control.problem.names import join_units
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.laws import LawName, ParametersInTime, Uncertainty, noises
 from sparserob_core.control.studies.simulate import (
-    delivered,
+    deliver_control,
     fine_times,
-    finer,
+    refine_grid,
     simulate_states,
     times_inside,
     trajectories_at_once,
@@ -155,7 +155,7 @@ def _simulate_samples(
     acting, parameters_in_time = _FeedbackControl(), ParametersInTime.of(model.stated)
     ends = [moment for constraint in model.constraints for moment in (constraint.start, constraint.stop)]
     times = fine_times(response, parameters, np.concatenate([ends, worst.get("times", np.zeros(0))]))
-    fine = Response(response.system, finer(response.grid, times), response.initial_state)
+    fine = Response(response.system, refine_grid(response.grid, times), response.initial_state)
     shown = np.unique(np.linspace(0, times.size - 1, min(times.size, SHOWN)).round().astype(int))
     worst_points = tuple(worst[name] for name in ("times", "directions", "parameters"))
     uncertainty = Uncertainty(
@@ -185,7 +185,7 @@ def _simulate_samples(
         if callable(control):
             control = acting.of(control)
         elif (errors := uncertainty.errors(law, size, control, rng)) is not None:
-            control = delivered(control, errors)
+            control = deliver_control(control, errors)
         for violation_count in violation_counts:
             violation_count.begin(size)
         for position, state in enumerate(
@@ -338,7 +338,7 @@ def _compute_shares(counts: Sequence[ViolationCount], worst: Mapping[str, Array]
 
 def _get_units(constraint: StateConstraint) -> dict[str, str]:
     """Return the unit of a constraint's violations, and that of times."""
-    return {"unit": joined(constraint.measured).strip(), "time_unit": constraint.functionals.names.time}
+    return {"unit": join_units(constraint.measured).strip(), "time_unit": constraint.functionals.names.time}
 
 
 def _merge_shares(shares: Sequence[ConstraintShare], violated: int) -> ConstraintShare:

@@ -393,7 +393,7 @@ def join_columns(left: Entries, right: Entries) -> Entries:
     return _join_matrices(left, right, 1)
 
 
-def above(upper: Entries, lower: Entries) -> Entries:
+def stack_matrices(upper: Entries, lower: Entries) -> Entries:
     """Return two matrices as one, one above the other.
 
     Parameters

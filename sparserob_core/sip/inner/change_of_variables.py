@@ -86,7 +86,7 @@ class DividedRows:
         return np.asarray(solve_triangular(self.lower, prices, lower=True, trans=1))
 
 
-def in_new_variables(program: FiniteProgram) -> NewVariables | None:
+def change_variables(program: FiniteProgram) -> NewVariables | None:
     """Return the program in coordinates that make it easier; ``None`` where it has such coordinates already."""
     divided = _divide_rows(program)
     if divided is not None:

@@ -88,7 +88,7 @@ def curvature_of(program: FiniteProgram) -> Array | None:
     return _curvatures.recall((P,), None, lambda: least_curvature(P.toarray()))
 
 
-def with_curvature(program: FiniteProgram, solution: FiniteSolution) -> FiniteSolution:
+def add_curvature_bound(program: FiniteProgram, solution: FiniteSolution) -> FiniteSolution:
     """Return the solution with the lower bound that the curvature of its cost proves, where that is a better one."""
     bend = curvature_of(program)
     if bend is None or not np.isfinite(solution.x).all():

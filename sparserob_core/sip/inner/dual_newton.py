@@ -19,7 +19,7 @@ from sparserob_core.options import Options
 from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
-from sparserob_core.sip.inner.change_of_variables import in_new_variables
+from sparserob_core.sip.inner.change_of_variables import change_variables
 from sparserob_core.sip.inner.duality import bent_minimisers, measure
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 
@@ -70,7 +70,7 @@ class DualNewton(Solver, Options):
             program.b,
             P=P,
         )
-        solution, steps = from_nothing(finite, accuracy, self.points)
+        solution, steps = solve_from_nothing(finite, accuracy, self.points)
         gradient = 0.0 if finite.P is None else finite.P @ solution.x
         slope = program.q + gradient + solution.y @ finite.G + solution.mu @ finite.A
         low, high = solution.x <= program.lower, solution.x >= program.upper
@@ -84,7 +84,7 @@ def not_separable(program: FiniteProgram) -> str:
     """Return the reason why `DualNewton` cannot solve a program, in words; an empty text where it can."""
     if program.blocks is not None:
         return "its cost takes norms of several entries together"
-    easier = None if program.S is None else in_new_variables(program)
+    easier = None if program.S is None else change_variables(program)
     if program.S is not None and easier is None:
         return "its costs and bounds are of sums of entries, and there are no variables in which each has its own"
     if (easier.program if easier else program).curvature is None:
@@ -92,7 +92,7 @@ def not_separable(program: FiniteProgram) -> str:
     return ""
 
 
-def from_nothing(program: FiniteProgram, accuracy: float, points: int) -> tuple[FiniteSolution, int]:
+def solve_from_nothing(program: FiniteProgram, accuracy: float, points: int) -> tuple[FiniteSolution, int]:
     """Return the best answer to a separable program that at most so many proximal points find from nothing, and how
     many it took; it is not sought further once residual and gap are at most ``accuracy``."""
     from scipy.sparse import dia_array

@@ -1,9 +1,9 @@
 """Lower bounds of a finite program that hold for *any* multipliers, however inaccurate the solver that offered them.
 
 `dual_bound` and `farkas_bound` are weak duality, less an allowance for the rounding of their own evaluation; `measure`
-is everything that can be checked about a claim. Better multipliers make better bounds: `repaired` gives unbounded
-variables the exact slopes that they ask for, and `vertex_multipliers` are those of the plain program at the optimiser
-of a regularised one.
+is everything that can be checked about a claim. Better multipliers make better bounds: `repair_multipliers` gives
+unbounded variables the exact slopes that they ask for, and `vertex_multipliers` are those of the plain program at the
+optimiser of a regularised one.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import numpy as np
 from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
-from sparserob_core.sip.inner.equalities import onto_equalities
+from sparserob_core.sip.inner.equalities import project_onto_equalities
 from sparserob_core.sip.inner.extended import extended_bound
-from sparserob_core.sip.inner.image import onto_stationary, within_bounds
+from sparserob_core.sip.inner.image import move_within_bounds, project_onto_stationary
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -75,11 +75,11 @@ def dual_bound(
     ``S'z + G'y + A'mu + q + P at = 0``, so any guess will do. An allowance for the round-off of this very evaluation is
     subtracted. Where an unbounded variable asks for a slope of exactly 0, a slope within its own round-off counts as 0.
     """
-    return proving(program, y, mu, z, at)[0]
+    return bound_with_multipliers(program, y, mu, z, at)[0]
 
 
 @shaped
-def proving(
+def bound_with_multipliers(
     program: FiniteProgram,
     y: Float[Array, " r"],
     mu: Float[Array, " e"],
@@ -105,7 +105,7 @@ def _prove_bound(
             if shrunk[0] > bound:
                 return shrunk
         return bound, y, mu, z
-    better = repaired(program, y, mu, z, at)
+    better = repair_multipliers(program, y, mu, z, at)
     if better is not None:
         bound = _evaluate_bound(_compute_terms(program, *better), program)
     if bound == -np.inf and not program.q.any() and program.blocks is None:
@@ -141,10 +141,10 @@ def farkas_margin(
     if not (np.isfinite(total) and total > 0):
         return -np.inf, 0.0
     y, mu, z = y / total, mu / total, None if z is None else z / total
-    flat = homogeneous(program)
+    flat = remove_cost(program)
     terms = _compute_terms(flat, y, mu, z, None)
     bound = _evaluate_bound(terms, flat)
-    if bound == -np.inf and (better := repaired(flat, y, mu, z, None)) is not None:
+    if bound == -np.inf and (better := repair_multipliers(flat, y, mu, z, None)) is not None:
         terms = _compute_terms(flat, *better)
         bound = _evaluate_bound(terms, flat)
     return bound, terms.magnitude
@@ -157,7 +157,7 @@ def farkas_proof(program: FiniteProgram, y: Array, mu: Array, z: Array | None, t
     return bound if bound > tolerance * max(1.0, magnitude) else None
 
 
-def homogeneous(program: FiniteProgram) -> FiniteProgram:
+def remove_cost(program: FiniteProgram) -> FiniteProgram:
     """Return the program with the same constraints and no cost."""
     q, weights = np.zeros_like(program.q), np.zeros_like(program.weights)
     return FiniteProgram(
@@ -178,7 +178,8 @@ def measure(
 
     The decision is first moved into its bounds and onto the equalities. Multipliers that are negative, or of rows
     without a finite right-hand side, become 0. The lower bound may be that of multipliers that were moved further,
-    which are not returned: see `proving`. The status is ``failed``, since the solution is not judged yet.
+    which are not returned: see `bound_with_multipliers`. The status is ``failed``, since the solution is not judged
+    yet.
 
     Parameters
     ----------
@@ -195,8 +196,8 @@ def measure(
     message : str
         Words of the solver.
     """
-    x = within_bounds(program, x)
-    x = onto_equalities(program, x) if program.b.size else x
+    x = move_within_bounds(program, x)
+    x = project_onto_equalities(program, x) if program.b.size else x
     y = _clip_multipliers(program, y)
     value, residual = program.objective(x), program.residual(x)
     terms = _compute_terms(program, y, mu, z, x)
@@ -258,7 +259,7 @@ def _compute_terms(
     if program.S is None:
         return Terms(constant, slope, noise, program.weights, curvature, magnitude, image, round_off)
     start = np.zeros(program.weights.size) if z is None else z
-    z = onto_stationary(program, start, slope)
+    z = project_onto_stationary(program, start, slope)
     noise = np.abs(z) + noise.max(initial=0.0)
     return Terms(constant, -z, noise, program.weights, None, magnitude, image, round_off)
 
@@ -303,7 +304,7 @@ def _weigh_rows(y: Array, rows: Array, mu: Array, equalities: Array) -> Array:
     return np.asarray(y @ rows + mu @ equalities if mu.size else y @ rows)
 
 
-def without_norms(terms: Terms, program: FiniteProgram) -> Terms:
+def replace_norms(terms: Terms, program: FiniteProgram) -> Terms:
     """Replace every block's ``weight |s|`` by ``d's`` for the ``|d| <= weight`` that bounds more: that nearest to what
     the slope asks for, or that of the tangent at an image."""
     blocks = program.blocks
@@ -332,7 +333,7 @@ def without_norms(terms: Terms, program: FiniteProgram) -> Terms:
 
 
 def _evaluate_bound(terms: Terms, program: FiniteProgram) -> float:
-    terms = without_norms(terms, program)
+    terms = replace_norms(terms, program)
     slope = terms.slope
     if not (isfinite(terms.constant) and np.isfinite(slope).all()):
         return -np.inf
@@ -374,9 +375,9 @@ def _shrink_multipliers(
     at: Float[Array, " n"] | None,
     beyond: Bool[np.ndarray, " k"],
 ) -> tuple[float, Float[Array, " r"], Float[Array, " e"], Float[Array, " k"] | None]:
-    """Return the result of `proving` with multipliers scaled towards 0, for a program without a linear cost. They are
-    scaled until the slope of every entry ``beyond`` its weight is within it. Such entries have no bound, or one so far
-    away that rounding of the slope costs more than the scaling."""
+    """Return the result of `bound_with_multipliers` with multipliers scaled towards 0, for a program without a linear
+    cost. They are scaled until the slope of every entry ``beyond`` its weight is within it. Such entries have no bound,
+    or one so far away that rounding of the slope costs more than the scaling."""
     slope = _compute_terms(program, y, mu, z, at).slope
     with np.errstate(invalid="ignore"):
         factor = float((program.weights[beyond] / np.abs(slope[beyond])).min(initial=1.0)) * (1 - ROUND_OFF)
@@ -387,7 +388,7 @@ def _shrink_multipliers(
 
 
 @shaped
-def repaired(
+def repair_multipliers(
     program: FiniteProgram,
     y: Float[Array, " r"],
     mu: Float[Array, " e"],

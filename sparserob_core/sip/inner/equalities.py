@@ -7,7 +7,7 @@ import numpy as np
 from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram
-from sparserob_core.sip.inner.image import within_bounds
+from sparserob_core.sip.inner.image import move_within_bounds
 
 CORRECTION_STEPS = 3  # of least squares, at most, each with the residual of the last one
 SUM_ROUNDING = 2.0**-52  # of the numbers that are added up, what is left to rounding
@@ -18,7 +18,7 @@ RANK_TOLERANCE = 1e-12  # of the largest singular value: a row below depends on 
 
 
 @shaped
-def onto_equalities(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Array, " n"]:
+def project_onto_equalities(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return a point near ``x (n,)`` that misses ``A x = b`` by less, down to rounding where that is possible.
 
     ``x`` itself is returned where it is as good already, where it misses an equality by more than `SPOILT_RESIDUAL`,
@@ -40,7 +40,7 @@ def onto_equalities(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Arra
         size = np.where(size > 0.0, size, 1.0)
         trial = x.copy()
         trial[free] += np.linalg.lstsq(rows / size[:, None], residual / size, rcond=RANK_TOLERANCE)[0]
-        trial = within_bounds(program, trial)
+        trial = move_within_bounds(program, trial)
         trial_share = program.equality_residual(trial)
         if not trial_share < share:
             break

@@ -50,7 +50,9 @@ _factors = Memory(12)
 
 
 @shaped
-def onto_stationary(program: FiniteProgram, z: Float[Array, " k"], slope: Float[Array, " n"]) -> Float[Array, " k"]:
+def project_onto_stationary(
+    program: FiniteProgram, z: Float[Array, " k"], slope: Float[Array, " n"]
+) -> Float[Array, " k"]:
     """Return a ``z (k,)`` near the given one with ``S'z + slope = 0`` to round-off, ``slope (n,)``; NaN where there is
     none.
 
@@ -78,7 +80,7 @@ def onto_stationary(program: FiniteProgram, z: Float[Array, " k"], slope: Float[
 
 
 @shaped
-def within_bounds(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Array, " n"]:
+def move_within_bounds(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return the decision ``x (n,)`` with every entry that is an image by itself, or a multiple of one, moved into the
     bounds of that image. An entry that may only be 0 is then 0, without the dust that a solver left."""
     if program.S is None:

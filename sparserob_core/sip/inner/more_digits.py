@@ -23,7 +23,7 @@ PROHIBITIVE_COST = 2.0**30  # a variable that costs this much stays at its bound
 DEPENDENT_ROW_SHARE = 1e-13  # of the largest entry: what is left of a row that depends on others
 
 
-def refined(program: QuadraticProgram, solver: Solver, start: Claim | None, accuracy: float) -> Iterator[Claim]:
+def refine_claims(program: QuadraticProgram, solver: Solver, start: Claim | None, accuracy: float) -> Iterator[Claim]:
     """Yield better and better claims from ``start``, or from zero; ends where the solver gives no numbers.
 
     Inequalities become ``G x + s = h`` with ``s >= 0``, so that only equalities ``M w = c`` and bounds on

@@ -11,7 +11,7 @@ import numpy as np
 from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import Blocks, Directions, FiniteProgram
-from sparserob_core.sip.inner.image import onto_stationary
+from sparserob_core.sip.inner.image import project_onto_stationary
 
 FAN = 8  # directions of a block of two entries, to begin with
 MAX_CUBE_ENTRIES = 4  # entries of a block up to which the corners of a cube are looked at too
@@ -19,7 +19,7 @@ BLOCK_DIRECTIONS_KEPT = 6  # directions of a block, those nearest to what an ans
 NEGLIGIBLE_NORM = 1e-14  # of the largest norm: a block that has no direction
 
 
-def around(blocks: Blocks) -> Directions:
+def spread_directions(blocks: Blocks) -> Directions:
     """Return directions all round for every block, to begin with."""
     width = blocks.table.shape[1]
     sizes = (blocks.table >= 0).sum(axis=1)
@@ -43,7 +43,7 @@ def _list_unit_vectors(size: int) -> Array:
 
 
 @shaped
-def towards(
+def find_block_directions(
     program: FiniteProgram,
     blocks: Blocks,
     x: Float[Array, " n"],
@@ -56,12 +56,12 @@ def towards(
     slope = slope if program.P is None else slope + program.P @ x
     wanted = -slope
     if program.S is not None:
-        wanted = onto_stationary(program, np.zeros(program.weights.size) if z is None else z, slope)
+        wanted = project_onto_stationary(program, np.zeros(program.weights.size) if z is None else z, slope)
     groups = [_find_directions(blocks, vector) for vector in (program.image(x), wanted) if np.isfinite(vector).all()]
     return Directions(np.concatenate([group.block for group in groups]), np.vstack([group.vectors for group in groups]))
 
 
-def near(directions: Directions, wanted: Directions) -> Directions:
+def select_nearest_directions(directions: Directions, wanted: Directions) -> Directions:
     """Return, for every block, the at most `BLOCK_DIRECTIONS_KEPT` directions that are nearest to one of its ``wanted``
     directions."""
     kept = []
@@ -75,7 +75,7 @@ def near(directions: Directions, wanted: Directions) -> Directions:
 
 
 @shaped
-def bent(
+def expand_norms(
     program: FiniteProgram, blocks: Blocks, x: Float[Array, " n"], moving: Bool[np.ndarray, " b"]
 ) -> FiniteProgram:
     """Return the program with the norm of every ``moving (b,)`` block replaced by its second-order expansion at

@@ -34,14 +34,20 @@ from sparserob_core.sip.finite import (
     FiniteProgram,
     FiniteSolution,
 )
-from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables
-from sparserob_core.sip.inner.curved import with_curvature
-from sparserob_core.sip.inner.dual_newton import from_nothing, polish
+from sparserob_core.sip.inner.change_of_variables import NewVariables, change_variables
+from sparserob_core.sip.inner.curved import add_curvature_bound
+from sparserob_core.sip.inner.dual_newton import polish, solve_from_nothing
 from sparserob_core.sip.inner.duality import farkas_proof, measure, minimisers, vertex_multipliers
-from sparserob_core.sip.inner.more_digits import refined
-from sparserob_core.sip.inner.norms import around, bent, near, of_the_rest, towards
+from sparserob_core.sip.inner.more_digits import refine_claims
+from sparserob_core.sip.inner.norms import (
+    expand_norms,
+    find_block_directions,
+    of_the_rest,
+    select_nearest_directions,
+    spread_directions,
+)
 from sparserob_core.sip.inner.standard_form import Form, Recovered, has_cones, standard_form
-from sparserob_core.sip.inner.vertex import many, sifted, simplex
+from sparserob_core.sip.inner.vertex import has_many_entries, simplex, solve_by_sifting
 from sparserob_core.sip.solver import AccountedSolver, Claim, QuadraticProgram, Solver
 
 # The accuracy that a solver is asked for, in multiples of the tolerance, in each form, until it is believed.
@@ -118,7 +124,7 @@ class _Case:
         """Return the solution, which is ``by`` somebody, as ``optimal`` if believed and sharp; otherwise keep it, or
         note why it is not believed."""
         if solution.residual <= self.tolerance and not self.believes(solution):
-            solution = with_curvature(self.program, solution)
+            solution = add_curvature_bound(self.program, solution)
         if self.believes(solution):
             message, attempts = f"{name}: {solution.message}", tuple(self.attempts)
             believed = replace(solution, status="optimal", attempts=attempts, message=message, by=by or solution.by)
@@ -207,7 +213,7 @@ def _solve_case(case: _Case, guess: FiniteSolution | None) -> FiniteSolution:
     case.attempts.clear()
     if program.blocks is not None and program.S is None:
         return _solve_by_directions(case, program.blocks, guess)
-    easier = in_new_variables(program)
+    easier = change_variables(program)
     answer = None if easier is None else _solve_in_new_variables(case, easier, guess)
     if answer is None and program.blocks is not None:
         return _solve_by_directions(case, program.blocks, guess)
@@ -220,10 +226,10 @@ def _solve_by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | No
     """Treat norms of blocks as second-order cones, where there is a solver that takes them (`_solve_conic`). Otherwise
     treat them as the largest of ``d's`` over finitely many directions (Kelley 1960), those of the answers and those
     that their multipliers ask for. This ends where the cost with the norms themselves meets the bound."""
-    program, directions = case.program, around(blocks)
+    program, directions = case.program, spread_directions(blocks)
     if guess is not None and np.isfinite(guess.x).all():
-        wanted = towards(program, blocks, guess.x, guess.y, guess.mu, guess.z)
-        guessed = () if guess.directions is None else (near(guess.directions, wanted),)
+        wanted = find_block_directions(program, blocks, guess.x, guess.y, guess.mu, guess.z)
+        guessed = () if guess.directions is None else (select_nearest_directions(guess.directions, wanted),)
         for addition in (wanted, *guessed):
             directions = directions.joined(addition)
         if program.S is None:
@@ -292,7 +298,7 @@ def _solve_by_kelley(
         idle = 0 if gap < 0.9 * closest else idle + 1
         closest = min(closest, gap)
         x, y, mu, z = answer
-        extended = directions.joined(towards(program, blocks, x, y, mu, z))
+        extended = directions.joined(find_block_directions(program, blocks, x, y, mu, z))
         if idle > PATIENCE or extended.block.size == directions.block.size or case.given_up:
             break
         directions = extended
@@ -327,7 +333,7 @@ def _refine_by_newton(
     for _ in range(NEWTON):
         if not moving.any() or case.given_up:
             break
-        step = bent(program, blocks, centre, moving)
+        step = expand_norms(program, blocks, centre, moving)
         fixed_directions = None if step.blocks is None else of_the_rest(directions, moving, step.blocks.table.shape[1])
         _, candidate = _ask_solver(case, step, "epigraph", accuracy, fixed_directions)
         if candidate is None or not np.isfinite(candidate[0]).all():
@@ -428,7 +434,7 @@ def _refine_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:
     for start in (None, claim) if usable else (None,):
         badness = np.inf
         try:
-            for refined_claim in refined(qp, case.solver, start, factor * case.tolerance):
+            for refined_claim in refine_claims(qp, case.solver, start, factor * case.tolerance):
                 case.heard(refined_claim)
                 candidates = list(_list_candidates(case, recover(refined_claim), refined_claim.message))
                 judged = [case.judge(solution, "with more digits", by) for by, solution in candidates]
@@ -491,8 +497,8 @@ def _list_cheap_answers(case: _Case, guess: FiniteSolution | None) -> Iterator[t
             yield CLOSED_FORM, measure(program, x, zero, none, message="no row is active")
     if HIGHS in quick and program.S is None and not program.bounded:  # where others take long, and a vertex is exact
         yield from ((HIGHS, solution) for solution in _list_corners(case))
-    if HIGHS in quick and many(program):
-        corner = sifted(program, *((None, None) if guess is None else (guess.y, guess.mu)))
+    if HIGHS in quick and has_many_entries(program):
+        corner = solve_by_sifting(program, *((None, None) if guess is None else (guess.y, guess.mu)))
         if corner.status == "optimal":
             yield HIGHS, measure(program, corner.x, corner.y, corner.mu, message="simplex method")
     if DUAL_NEWTON in quick and guess is not None:
@@ -501,7 +507,7 @@ def _list_cheap_answers(case: _Case, guess: FiniteSolution | None) -> Iterator[t
             yield DUAL_NEWTON, polished
     large = program.separable and program.h.size >= CROWDED and program.n >= WIDE
     if DUAL_NEWTON in quick and large and program.curvature is not None and program.curvature.min() > 0.0:
-        yield DUAL_NEWTON, from_nothing(program, 0.1 * case.tolerance, MAX_PROXIMAL_POINTS)[0]
+        yield DUAL_NEWTON, solve_from_nothing(program, 0.1 * case.tolerance, MAX_PROXIMAL_POINTS)[0]
 
 
 def _ask_solver(
@@ -552,7 +558,7 @@ def _find_elastic_proof(case: _Case, known: FiniteSolution | None) -> FiniteSolu
         return known
     case.elastic = True
     for by, answer in _list_elastic_answers(case, ("split", "epigraph") if known is None else ("split",)):
-        proof = _check_proof(case, unrelaxed(case.program, answer), "the elastic program")
+        proof = _check_proof(case, interpret_elastic_answer(case.program, answer), "the elastic program")
         if proof is not None and (known is None or proof.infeasibility > known.infeasibility):
             return replace(proof, by=by)
     return known
@@ -621,7 +627,7 @@ def elastic_program(program: FiniteProgram) -> FiniteProgram:
     )
 
 
-def unrelaxed(program: FiniteProgram, answer: Recovered) -> Recovered:
+def interpret_elastic_answer(program: FiniteProgram, answer: Recovered) -> Recovered:
     """Return an answer to the elastic program in terms of ``program``: its ``x``, and multipliers that may prove
     infeasibility."""
     x, multipliers, _, z = answer

@@ -42,13 +42,13 @@ def vertex(program: FiniteProgram, y: Array | None = None, mu: Array | None = No
     Multipliers ``y (r,)``, ``mu (e,)`` that are nearly optimal spare most of the work."""
     if program.P is not None or program.blocks is not None:
         return None
-    corner = sifted(program, y, mu) if many(program) else simplex(program)
+    corner = solve_by_sifting(program, y, mu) if has_many_entries(program) else simplex(program)
     return corner.x if corner.status == "optimal" else None
 
 
-def many(program: FiniteProgram) -> bool:
-    """Return whether a linear program is to be solved by `sifted`: separable, with at least `SIFTED_ENTRIES` entries,
-    and with rows."""
+def has_many_entries(program: FiniteProgram) -> bool:
+    """Return whether a linear program is to be solved by `solve_by_sifting`: separable, with at least `SIFTED_ENTRIES`
+    entries, and with rows."""
     return bool(
         program.n >= SIFTED_ENTRIES
         and program.h.size + program.b.size
@@ -56,7 +56,7 @@ def many(program: FiniteProgram) -> bool:
     )
 
 
-def sifted(program: FiniteProgram, y: Array | None = None, mu: Array | None = None) -> Corner:
+def solve_by_sifting(program: FiniteProgram, y: Array | None = None, mu: Array | None = None) -> Corner:
     """Apply `simplex` to the entries that may be between 0 and their bounds, while the others stay where the
     multipliers put them; until none of these is in the wrong place (sifting, Bixby, Gregory, Lustig, Marsten and Shanno
     1992).

@@ -11,16 +11,16 @@ from pydantic import Field
 
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options
-from sparserob_core.sip.events import RoundFinished, forwarded
+from sparserob_core.sip.events import RoundFinished, forward_events
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
-from sparserob_core.sip.proof.verdict import as_bad_as_found, verdict, witness, worst_of
+from sparserob_core.sip.proof.verdict import include_found_violation, verdict, witness, worst_of
 from sparserob_core.sip.result import Result, relative_gap
 from sparserob_core.sip.scenario_bound import scenario_bound
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.ledger import alarm, unproven
+from sparserob_core.sip.working.ledger import alarm, prove_nothing
 
 
 class Nominal(Method, Options):
@@ -96,9 +96,9 @@ def _judge_simplified(
 ) -> Result:
     """Solve the simpler program, whose lower bound holds for the full one too, and say what its decision is worth in
     the full one."""
-    notify = forwarded(tools.notify, RoundFinished, lambda event: replace(event, simplified=True))
+    notify = forward_events(tools.notify, RoundFinished, lambda event: replace(event, simplified=True))
     method = Exchange(tolerance=tolerance, rounds=rounds)
-    result = method.close(simple, replace(tools, notify=notify), unproven)  # the full one is proven below
+    result = method.close(simple, replace(tools, notify=notify), prove_nothing)  # the full one is proven below
     if result.decision is None:
         return result
     x, separations = result.decision, []
@@ -106,7 +106,7 @@ def _judge_simplified(
         separations = separate(program, x, tools, TOLERANCE)
     except KeyboardInterrupt as error:
         tools.deadline.interrupt(error)
-    proofs = as_bad_as_found(prove(program, x, tools.notify, deadline=tools.deadline), separations)
+    proofs = include_found_violation(prove(program, x, tools.notify, deadline=tools.deadline), separations)
     status, message = verdict(proofs, relative_gap(result.dual.bound, result.cost, result.cost_scale), tolerance)
     proven = status in ("certified", "verified")
     wrong = alarm(simple, result.dual, x) if proven else ""

@@ -18,13 +18,13 @@ from scipy.sparse import csr_array, diags_array, eye_array, hstack, kron
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import NO_BOUND, Branch, Dual, Leaf
 from sparserob_core.sip.finite import HIGHS, NOBODY, FiniteProgram
-from sparserob_core.sip.inner.duality import farkas_proof, proving
-from sparserob_core.sip.inner.simplex.interruptible import with_integers
-from sparserob_core.sip.inner.solve import elastic_program, unrelaxed
+from sparserob_core.sip.inner.duality import bound_with_multipliers, farkas_proof
+from sparserob_core.sip.inner.simplex.interruptible import solve_with_integers
+from sparserob_core.sip.inner.solve import elastic_program, interpret_elastic_answer
 from sparserob_core.sip.inner.vertex import Corner, simplex
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
-from sparserob_core.sip.working.counting import MISSED, convex_below, prices_of, vectors, whole
+from sparserob_core.sip.working.counting import MISSED, convex_below, prices_of, round_up_count, vectors
 
 MIXED_INTEGER_SECONDS = 20.0  # that a mixed-integer program may take
 INTEGRAL = 1e-6  # of an entry's range, within which it is 0 or a letter
@@ -77,7 +77,7 @@ class Branching:
         return min((self._round_bound(bound) for bound, _ in self._heap), default=np.inf)
 
     def _round_bound(self, bound: float) -> float:
-        return bound if np.isinf(bound) else whole(self.program, bound - PART_BOUND_ALLOWANCE * abs(bound))
+        return bound if np.isinf(bound) else round_up_count(self.program, bound - PART_BOUND_ALLOWANCE * abs(bound))
 
     def open(self, incumbent: float) -> bool:
         """Return whether a part may contain a decision that counts less than the ``incumbent``."""
@@ -152,7 +152,7 @@ class Branching:
         if corner.status != "optimal":
             return fallback, leaf
         candidates = [(y, mu, z), (np.zeros_like(y), np.zeros_like(mu), None)]
-        bounds = [proving(finite, *candidate) for candidate in candidates]
+        bounds = [bound_with_multipliers(finite, *candidate) for candidate in candidates]
         bound, y, mu, z = max(bounds, key=lambda item: item[0])
         bound += certain - self.relaxed.rounding(finite, y, mu, corner.x)
         if bound > part.bound:
@@ -234,10 +234,10 @@ def _find_infeasibility(program: FiniteProgram) -> Corner:
     corner = simplex(elastic_program(program))
     if corner.status != "optimal":
         return Corner("infeasible", np.zeros(program.n), np.zeros(program.h.size), np.zeros(program.b.size))
-    return Corner("infeasible", *unrelaxed(program, (corner.x, corner.y, corner.mu, corner.z)))
+    return Corner("infeasible", *interpret_elastic_answer(program, (corner.x, corner.y, corner.mu, corner.z)))
 
 
-def proposed(
+def propose_decision(
     program: SemiInfiniteProgram, relaxed: RelaxedProgram, rows: Rows, letters: Array | None, gap: float = 0.0
 ) -> Array | None:
     """Return a decision ``(n,)`` with the fewest counted entries among all that satisfy the ``rows``, as HiGHS finds
@@ -280,7 +280,7 @@ def proposed(
     ]
     bounds = np.repeat([-np.inf, 0.0], [n, count]), np.repeat([np.inf, 1.0], [n, count])
     seconds = MIXED_INTEGER_SECONDS if seconds_left is None else min(MIXED_INTEGER_SECONDS, seconds_left)
-    solution = with_integers(np.concatenate([np.zeros(n), cost]), couplings, *bounds, n, seconds, gap)
+    solution = solve_with_integers(np.concatenate([np.zeros(n), cost]), couplings, *bounds, n, seconds, gap)
     return None if solution is None else solution[:n]
 
 

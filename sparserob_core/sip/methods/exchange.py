@@ -32,13 +32,13 @@ from sparserob_core.sip.working.ledger import (
     Ledger,
     Prover,
     Violated,
-    above,
     list_violated,
     prover_of,
+    select_violated,
     witnesses,
 )
 from sparserob_core.sip.working.plain import PlainRows
-from sparserob_core.sip.working.tightening import or_proven, proofs_of, tighten_in_time
+from sparserob_core.sip.working.tightening import prefer_proven, proofs_of, tighten_in_time
 from sparserob_core.sip.working.working import Working
 
 
@@ -112,7 +112,7 @@ class Rounds:
         separations: Found = [
             pair for pair in separate(program, x, tools, SEARCH_TOLERANCE, number) if not pair[0].defines
         ]
-        violated: Violated = [above(*pair) for pair in separations]
+        violated: Violated = [select_violated(*pair) for pair in separations]
         feasible = not any(rows.size for _, rows, _ in violated)
         ledger.tell(number, answer, separations, program.cost(x) if feasible else np.inf, kept=working.size)
         self.kept = (answer, separations) if feasible else self.kept
@@ -170,7 +170,7 @@ class Rounds:
     def _choose_result(self, result: Result, answer: CheckedAnswer) -> Result:
         """The result, or that of a decision that is proven, or of the last one that seemed feasible, with an open gap,
         where only that is proven."""
-        result = or_proven(self.ledger, result)
+        result = prefer_proven(self.ledger, result)
         if result.status not in ("refuted", "undecided") or self.kept is None or self.kept[0] is answer:
             return result
         kept_answer, separations = self.kept

@@ -25,7 +25,7 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.verdict import verdict
 from sparserob_core.sip.result import Result, relative_gap
 from sparserob_core.sip.working.counting import DUST, count, prices_of
-from sparserob_core.sip.working.ledger import prover_of, unproven
+from sparserob_core.sip.working.ledger import prove_nothing, prover_of
 
 FEWER = 1e-9  # relative: a count that is less by no more than this is the same
 PROVEN = ("certified", "verified")
@@ -72,7 +72,7 @@ class Reweighted(Method, Options):
             heavier_program = replace(
                 program, weights=program.finite.weights * self._compute_weights(program, x), twin=None
             )
-            weighted_result = exchange.close(heavier_program, labelled_tools, unproven, imposed_cuts(cuts))
+            weighted_result = exchange.close(heavier_program, labelled_tools, prove_nothing, imposed_cuts(cuts))
             spent.append(weighted_result)
             if weighted_result.decision is None or weighted_result.status not in PROVEN:
                 break
@@ -86,7 +86,7 @@ class Reweighted(Method, Options):
                 break
         if best is first.decision:
             return first.charged(spent)
-        result = on_support(program, best, tools, exchange, cuts)
+        result = solve_on_support(program, best, tools, exchange, cuts)
         spent.append(result)
         if (
             result.decision is None
@@ -119,7 +119,7 @@ class Reweighted(Method, Options):
         return np.asarray(self.scale / (share + self.scale))
 
 
-def on_support(
+def solve_on_support(
     program: SemiInfiniteProgram, x: Array, tools: Tools, exchange: Exchange, known: Sequence[Cut]
 ) -> Result:
     """The decision of least cost, proven, that acts on no other entries than ``x (n,)`` does; ``known`` constraints are

@@ -21,14 +21,14 @@ from pydantic import Field, field_validator
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options, part
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import DECIDING, EvaluationsFinished, forwarded, frozen, ignore
+from sparserob_core.sip.events import DECIDING, EvaluationsFinished, forward_events, frozen, ignore
 from sparserob_core.sip.evidence import Dual
 from sparserob_core.sip.limits.deadline import LAST_STEP_SECONDS, Deadline, OutOfTime
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.driver import drive
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
-from sparserob_core.sip.proof.verdict import as_bad_as_found, worst_of
+from sparserob_core.sip.proof.verdict import include_found_violation, worst_of
 from sparserob_core.sip.relaxed.batches import Batches, Oracle
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
 from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
@@ -160,7 +160,7 @@ class _OuterIteration:
             ledger.improve(ledger.relaxed.lower_bound(answer.rows, plain))
         proofs = prove(program, x, tools.notify, deadline=tools.deadline)
         separations = separate(program, x, tools)
-        worst_proofs = as_bad_as_found(proofs, separations)
+        worst_proofs = include_found_violation(proofs, separations)
         short = MORE_EVALUATIONS if any(proof.verdict == "refuted" for proof in worst_proofs) else ""
         result = ledger.judged(answer, worst_of(separations), worst_proofs, tools.deadline.reason or short)
         return _choose_result(ledger, result, answer)
@@ -216,7 +216,7 @@ def _search_tuples(
     assert tools.maximiser is not None
     rules = Rules(method.sc2, method.slcr or Metropolis(), tools.polish)
     target = Target(values, g.domain, g.gradient, g.block, g.linear, g.acting)
-    notify = forwarded(tools.notify, EvaluationsFinished, completed)
+    notify = forward_events(tools.notify, EvaluationsFinished, completed)
     early_deadline = tools.deadline.sooner(
         min(MAX_PROOF_SECONDS, PROOF_SHARE_OF_LIMIT * (tools.deadline.seconds or 0.0))
     )

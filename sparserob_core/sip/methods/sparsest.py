@@ -20,21 +20,29 @@ from scipy.sparse import csc_array, eye_array
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import RoundFinished, StageProgress, forward_progress, forwarded, ignore
+from sparserob_core.sip.events import RoundFinished, StageProgress, forward_events, forward_progress, ignore
 from sparserob_core.sip.evidence import Cut, Leaf, Sparsest
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
-from sparserob_core.sip.methods.branching import Branching, proposed
+from sparserob_core.sip.methods.branching import Branching, propose_decision
 from sparserob_core.sip.methods.driver import drive
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.methods.reweighted import imposed_cuts, on_support
+from sparserob_core.sip.methods.reweighted import imposed_cuts, solve_on_support
 from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.verdict import verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
 from sparserob_core.sip.result import Result, relative_gap
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.counting import DUST, completed, count, count_of, counted_below, counting, prices_of
-from sparserob_core.sip.working.ledger import unproven
+from sparserob_core.sip.working.counting import (
+    DUST,
+    complete_decision,
+    count,
+    count_of,
+    counted_below,
+    counting,
+    prices_of,
+)
+from sparserob_core.sip.working.ledger import prove_nothing
 from sparserob_core.sip.working.tightening import PAID
 
 PROVEN = ("certified", "verified")
@@ -177,9 +185,9 @@ class _SparsestSearch:
             self.reported = replace(event, upper_bound=np.inf, gap=np.inf)
             return self.reported
 
-        tools = replace(self.tools, notify=forwarded(self.tools.notify, RoundFinished, heard), regulariser=None)
+        tools = replace(self.tools, notify=forward_events(self.tools.notify, RoundFinished, heard), regulariser=None)
         method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)
-        result = method.close(below.program, tools, unproven, imposed_cuts(self.rows.cuts))
+        result = method.close(below.program, tools, prove_nothing, imposed_cuts(self.rows.cuts))
         self.spent.append(result)
         if result.status == "infeasible":
             letters = tuple(self.method.alphabet or ())
@@ -216,7 +224,7 @@ class _SparsestSearch:
             return False
         self.tried.add(key)
         method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)
-        result = on_support(self.program, x, self.tools, method, self.rows.cuts)
+        result = solve_on_support(self.program, x, self.tools, method, self.rows.cuts)
         self.spent.append(result)
         is_new = self._impose_cuts([*result.indices, *result.dual.cuts])
         if result.status in PROVEN and result.decision is not None:
@@ -230,7 +238,7 @@ class _SparsestSearch:
     def _round_to_letters(self, image: Array) -> Array:
         assert self.letters is not None
         nearest = np.abs(image[: len(self.letters), None] - self.letters).argmin(axis=1)
-        return completed(self.program, self.letters[np.arange(nearest.size), nearest])
+        return complete_decision(self.program, self.letters[np.arange(nearest.size), nearest])
 
     def _prove_letters(self, x: Array) -> bool:
         """Prove a decision of letters, or impose what it violates."""
@@ -334,7 +342,7 @@ class _SparsestSearch:
         norms = np.linalg.norm(self.rows.G, axis=1)
         rows = replace(self.rows, h=self.rows.h - self.margin * norms) if crude else self.rows
         self.tools.notify(StageProgress(text="proposal: which entries may be fewer, by the mixed-integer solver"))
-        x = proposed(self.bounded, self.relaxed, rows, self.letters, ANY if crude else 0.0)
+        x = propose_decision(self.bounded, self.relaxed, rows, self.letters, ANY if crude else 0.0)
         if x is None and crude and self.margin > 0.0:
             self.margin, self.roomy = 0.0, False
             return True

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from sparserob_core.sip.finite import FiniteSolution
-from sparserob_core.sip.inner.duality import farkas_bound, farkas_proof, homogeneous, measure
-from sparserob_core.sip.inner.solve import SIMPLEX_STEPS_PER_ROW, elastic_program, unrelaxed
+from sparserob_core.sip.inner.duality import farkas_bound, farkas_proof, measure, remove_cost
+from sparserob_core.sip.inner.solve import SIMPLEX_STEPS_PER_ROW, elastic_program, interpret_elastic_answer
 from sparserob_core.sip.inner.vertex import simplex
 from sparserob_core.sip.proof.reasons import reasons
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
@@ -18,7 +18,9 @@ from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 MAX_FILTERED_ROWS = 40
 
 
-def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -> tuple[Rows, FiniteSolution, bool]:
+def find_irreducible_rows(
+    relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution
+) -> tuple[Rows, FiniteSolution, bool]:
     """Return rows that cannot hold together, none of which was found to be dispensable, with multipliers as a proof.
 
     A constraint that is impossible by itself, or two constraints that leave nothing between them, are returned at once
@@ -82,11 +84,11 @@ def _move_to_vertex(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolutio
     corner = simplex(elastic_program(finite), SIMPLEX_STEPS_PER_ROW * (finite.n + finite.h.size))
     if corner.status != "optimal":
         return solution
-    x, y, mu, z = unrelaxed(finite, (corner.x, corner.y, corner.mu, corner.z))
+    x, y, mu, z = interpret_elastic_answer(finite, (corner.x, corner.y, corner.mu, corner.z))
     amount = farkas_proof(finite, y, mu, z, relaxed.tolerance)
     if amount is None or np.count_nonzero(y) >= size or not y[fixed:].any():
         return solution
-    measured = measure(homogeneous(finite), x, y, mu, z)
+    measured = measure(remove_cost(finite), x, y, mu, z)
     return replace(solution, y=y, mu=mu, z=measured.z, infeasibility=amount)
 
 
@@ -102,7 +104,7 @@ def _find_evident_reason(relaxed: RelaxedProgram, solution: FiniteSolution) -> t
         amount = farkas_bound(finite, y, np.zeros(base.b.size)) if reason.rows.G.any() else np.inf
         if amount > relaxed.tolerance:
             mu = np.zeros(base.b.size)
-            z = measure(homogeneous(finite), solution.x, y, mu).z
+            z = measure(remove_cost(finite), solution.x, y, mu).z
             return reason.rows, replace(
                 solution, y=y, mu=mu, z=z, infeasibility=amount, message=f"infeasible: {reason.text}"
             )

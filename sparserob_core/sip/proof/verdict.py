@@ -16,7 +16,7 @@ from sparserob_core.sip.program import (
     SemiInfiniteProgram,
     Separation,
     WorstConstraint,
-    told_apart,
+    distinguish_numbers,
 )
 from sparserob_core.sip.relaxed.relaxed import Rows
 from sparserob_core.sip.result import MEANING, Result, Status
@@ -60,7 +60,7 @@ def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Stat
     return status, f"{MEANING[status]} (gap {max(gap, 0.0):.1e})"
 
 
-def remarked(program: SemiInfiniteProgram, result: Result) -> Result:
+def add_warning(program: SemiInfiniteProgram, result: Result) -> Result:
     """Return the result with a warning where its claim rests on unproven answers of the families.
 
     Enclosures and separations of a program that was stated directly are believed, for only its rows can be evaluated. A
@@ -131,7 +131,9 @@ def _describe_contradiction(program: SemiInfiniteProgram, result: Result) -> str
     return ""
 
 
-def as_bad_as_found(proofs: Sequence[Proof], separations: Sequence[tuple[ConstraintFamily, Separation]]) -> list[Proof]:
+def include_found_violation(
+    proofs: Sequence[Proof], separations: Sequence[tuple[ConstraintFamily, Separation]]
+) -> list[Proof]:
     """Return the proofs with the worst violation that separation has found, for families that are not proven.
 
     A refutation ends at the first witness, which need not be the worst.
@@ -203,10 +205,10 @@ def witness(program: SemiInfiniteProgram, searched: WorstConstraint, proofs: Seq
         for proof in proofs
         if proof.index is not None and not program.family(proof.family).defines
     ]
-    return explained(program, max([searched, *candidates], key=lambda constraint: constraint.violation))
+    return add_facts(program, max([searched, *candidates], key=lambda constraint: constraint.violation))
 
 
-def explained(program: SemiInfiniteProgram, bare: WorstConstraint) -> WorstConstraint:
+def add_facts(program: SemiInfiniteProgram, bare: WorstConstraint) -> WorstConstraint:
     """Return the worst constraint with the facts that its family adds.
 
     Parameters
@@ -303,7 +305,7 @@ def _describe_subsystem(
     missing = max(own_bound, least_within(program.finite, combined) + required)
     demand, decides = "", explanations[0].decides
     if missing > 0 and required > 0:
-        required_text, available_text = told_apart(required, required - missing)
+        required_text, available_text = distinguish_numbers(required, required - missing)
         named = ", ".join(f"{y[i]:.3g}" for i in order[:MAX_NAMED_REASONS]) + (
             ", ..." if order.size > MAX_NAMED_REASONS else ""
         )
@@ -322,7 +324,7 @@ def _describe_subsystem(
 
 def _make_worst_constraint(program: SemiInfiniteProgram, cut: Cut, violation: float) -> WorstConstraint:
     """Return the worst constraint at a cut, with the facts that its family adds."""
-    return explained(program, WorstConstraint(violation, cut.family, cut.index, cut.row, cut.formulation))
+    return add_facts(program, WorstConstraint(violation, cut.family, cut.index, cut.row, cut.formulation))
 
 
 def _explain_cut(program: SemiInfiniteProgram, cut: Cut) -> Explanation:

@@ -56,7 +56,7 @@ class Valued:
     imposed: Sequence[Imposed] = ()
 
 
-def value_chunk(g: TupleValue, points: Array, best: float) -> Valued:
+def evaluate_chunk(g: TupleValue, points: Array, best: float) -> Valued:
     """Evaluate a chunk ``(k, D width)`` from nothing; ``best``: the best value before its batch, below which no bound
     is of use."""
     g.forget()
@@ -106,14 +106,14 @@ class _WorkerState(threading.local):
 _worker_state = _WorkerState()
 
 
-def on_worker(oracle: Oracle, points: Array, epsilon: float, best: float, seconds: float | None) -> Valued:
-    """`value_chunk` in a worker, who has ``seconds`` for it."""
+def evaluate_on_worker(oracle: Oracle, points: Array, epsilon: float, best: float, seconds: float | None) -> Valued:
+    """`evaluate_chunk` in a worker, who has ``seconds`` for it."""
     if _worker_state.oracle != oracle or _worker_state.g is None:
         _worker_state.oracle, _worker_state.g = oracle, oracle.build()
     g = _worker_state.g
     g.epsilon, g.relaxed.deadline = epsilon, Deadline(seconds)
     try:
-        return value_chunk(g, points, best)
+        return evaluate_chunk(g, points, best)
     except OutOfTime as over:
         return Valued(np.empty(0), {}, 0, 0, late=str(over))
 
@@ -142,12 +142,12 @@ class Batches:
         best = self._best
         chunks = [points[first : first + CHUNK_TUPLES] for first in range(0, len(points), CHUNK_TUPLES)]
         start = time.perf_counter()
-        values = [self._report_values(value_chunk(self.g, chunks[0], best), tell)]
+        values = [self._report_values(evaluate_chunk(self.g, chunks[0], best), tell)]
         seconds = time.perf_counter() - start
         if self._is_worth_sending(seconds, len(chunks) - 1, len(points)):
             values += [self._report_values(valued, tell) for valued in self._evaluate_on_workers(chunks[1:], best)]
         else:
-            values += [self._report_values(value_chunk(self.g, chunk, best), tell) for chunk in chunks[1:]]
+            values += [self._report_values(evaluate_chunk(self.g, chunk, best), tell) for chunk in chunks[1:]]
         self.g.forget(points[-1])
         return np.concatenate(values)
 
@@ -190,7 +190,7 @@ class Batches:
         valued_chunks, futures = list[Valued](), list[Future[Valued]]()
         try:
             for chunk in chunks:
-                futures.append(self.executor.submit(on_worker, self.oracle, chunk, g.epsilon, best, seconds))
+                futures.append(self.executor.submit(evaluate_on_worker, self.oracle, chunk, g.epsilon, best, seconds))
             for chunk, future in zip(chunks, futures, strict=True):
                 valued = future.result()
                 if valued.late:
@@ -208,4 +208,4 @@ class Batches:
         finally:
             for future in futures:
                 future.cancel()
-        return [*valued_chunks, *(value_chunk(g, chunk, best) for chunk in chunks[len(valued_chunks) :])]
+        return [*valued_chunks, *(evaluate_chunk(g, chunk, best) for chunk in chunks[len(valued_chunks) :])]

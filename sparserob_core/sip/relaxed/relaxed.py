@@ -19,8 +19,8 @@ from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.inner.curved import curvature_of, curved_bound
 from sparserob_core.sip.inner.dual_newton import DualNewton, not_separable
-from sparserob_core.sip.inner.duality import homogeneous, minimisers, proving, vertex_multipliers
-from sparserob_core.sip.inner.image import onto_stationary
+from sparserob_core.sip.inner.duality import bound_with_multipliers, minimisers, remove_cost, vertex_multipliers
+from sparserob_core.sip.inner.image import project_onto_stationary
 from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import SemiInfiniteProgram
@@ -284,19 +284,21 @@ class RelaxedProgram:
         if plain.P is not None or plain.blocks is not None:
             return self._prove_bound(plain, solution, zero, np.zeros_like(solution.mu), np.zeros_like(solution.z))
         if self._zero_bound is None:
-            self._zero_bound = proving(plain, zero, np.zeros_like(solution.mu), np.zeros_like(solution.z))
+            self._zero_bound = bound_with_multipliers(
+                plain, zero, np.zeros_like(solution.mu), np.zeros_like(solution.z)
+            )
         bound, _, mu, z = self._zero_bound
         return bound - self.rounding(plain, zero, mu, x), zero, mu, z, x
 
     def _prove_bound(self, plain: FiniteProgram, solution: FiniteSolution, y: Array, mu: Array, z: Array) -> _Proven:
         """A lower bound, less its rounding, with the multipliers that prove it and where the cost is touched."""
         if plain.P is not None and plain.separable and not plain.bounded:  # where a tangent says nothing
-            bound, y, mu, z_proving = proving(plain, y, mu, z)
+            bound, y, mu, z_proving = bound_with_multipliers(plain, y, mu, z)
             bound -= _bound_free_slopes(plain, y, mu, solution.x)
             at = _choose_tangent_point(plain, y, mu, solution.x)
         else:
             at = _choose_tangent_point(plain, y, mu, solution.x)
-            bound, y, mu, z_proving = proving(plain.tangent(at), y, mu, z, at=at)
+            bound, y, mu, z_proving = bound_with_multipliers(plain.tangent(at), y, mu, z, at=at)
         if solution.value - bound > UNCLOSED * abs(solution.value) and self._curvature is not None:
             better, point = curved_bound(plain, self._curvature, y, mu, at)
             bound, at = (better, point) if better > bound else (bound, at)
@@ -346,8 +348,8 @@ class RelaxedProgram:
         own = y[y.size - rows.h.size :]
         if self.program.finite.S is not None:
             plain = self.finite(rows.G, rows.h, 0.0) if of is None else of
-            plain = homogeneous(plain) if not priced else plain if at is None else plain.tangent(at)
-            z = onto_stationary(plain, z, plain.q + y @ plain.G + mu @ plain.A)
+            plain = remove_cost(plain) if not priced else plain if at is None else plain.tangent(at)
+            z = project_onto_stationary(plain, z, plain.q + y @ plain.G + mu @ plain.A)
         cuts = tuple(replace(cut, multiplier=float(m)) for cut, m in zip(rows.cuts, own, strict=True) if m > 0.0)
         fixed = y[: y.size - rows.h.size]
         return Dual(bound, cuts, mu, None if self.program.finite.S is None else z, fixed, at)

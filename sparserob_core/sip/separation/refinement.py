@@ -113,12 +113,12 @@ def surround(function: VectorFunction, maxima: Candidates) -> Candidates:
     dimension = maxima.points.shape[1]
     offsets = _build_stencil(dimension)
     middle = np.clip(maxima.points, MEASURED, 1.0 - MEASURED)
-    values = _evaluate_points(function, inside(middle[:, np.newaxis] + MEASURED * offsets), maxima.rows)
+    values = _evaluate_points(function, move_into_box(middle[:, np.newaxis] + MEASURED * offsets), maxima.rows)
     curvature, axes = np.linalg.eigh(_fit_models(middle, values, offsets).hessian / MEASURED**2)
     fall = 2.0 * SURROUNDING**2 * maxima.values[:, np.newaxis]
     steps = np.sqrt(fall / np.maximum(-curvature, fall / FARTHEST**2))[:, np.newaxis] * axes  # an axis in each column
     middle = np.repeat(maxima.points, 2 * dimension, axis=0)
-    points = inside(middle + np.concatenate([steps, -steps], axis=2).transpose(0, 2, 1).reshape(-1, dimension))
+    points = move_into_box(middle + np.concatenate([steps, -steps], axis=2).transpose(0, 2, 1).reshape(-1, dimension))
     rows = np.repeat(maxima.rows, 2 * dimension)
     values = _evaluate_points(function, points[:, np.newaxis], rows)[:, 0]
     return Candidates(points, rows, values, np.full(rows.size, MEASURED))
@@ -129,13 +129,13 @@ def _take_step(
 ) -> tuple[Candidates, Array, Truths]:
     radius = np.minimum(now.radius, 0.5)[:, np.newaxis]
     middle = np.clip(now.points, radius, 1 - radius)
-    stencil = inside(middle[:, np.newaxis] + radius[:, np.newaxis] * offsets)
+    stencil = move_into_box(middle[:, np.newaxis] + radius[:, np.newaxis] * offsets)
     stencil_values = _evaluate_points(function, stencil, now.rows)
     model = _fit_models(middle, stencil_values, offsets)
     steps = _maximise_models(
         model, np.maximum(-MAX_STEP_RADII, -middle / radius), np.minimum(MAX_STEP_RADII, (1 - middle) / radius)
     )
-    trial = inside(middle + radius * steps)
+    trial = move_into_box(middle + radius * steps)
     trial_values = _evaluate_points(function, trial[:, np.newaxis], now.rows)
     scale = np.maximum(1.0, np.abs(now.values))
     curved = np.einsum("aii->ai", model.hessian) / radius**2
@@ -171,7 +171,7 @@ def _build_stencil(dimension: int) -> Array:
     return np.array(offsets)
 
 
-def inside(points: Array) -> Array:
+def move_into_box(points: Array) -> Array:
     """Into the unit box; what is within rounding of a face lies on it."""
     points = np.where(points < 1e-15, 0.0, points)
     return np.where(points > 1 - 1e-15, 1.0, points)

@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import EvaluationsFinished, forwarded
+from sparserob_core.sip.events import EvaluationsFinished, forward_events
 from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
@@ -44,7 +44,7 @@ def separate(
     more than ``threshold``. Raises `OutOfTime` when the deadline of the tools has passed."""
 
     def search(family: ConstraintFamily) -> _ViolationSearch:
-        notify = forwarded(
+        notify = forward_events(
             tools.notify, EvaluationsFinished, lambda event: replace(event, family=family.name, round=number)
         )
         return _ViolationSearch(family, x, replace(tools, notify=notify), threshold)

@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.separation.refinement import Candidates, Truths, VectorFunction, inside
+from sparserob_core.sip.separation.refinement import Candidates, Truths, VectorFunction, move_into_box
 
 GRID_SIDE = {1: 257, 2: 33, 3: 13, 4: 7}
 RANDOM_POINTS = 2048
@@ -188,7 +188,7 @@ def _evaluate_level(function: VectorFunction, corners: Array, side: int, spacing
     """The values of blocks with these lower corners ``(p, d)``; points of several blocks are evaluated once."""
     count, dimension = corners.shape
     offsets = np.array(list(product(range(side), repeat=dimension)), dtype=float)
-    flat = inside(corners[:, np.newaxis] + spacing * offsets).reshape(count * len(offsets), dimension)
+    flat = move_into_box(corners[:, np.newaxis] + spacing * offsets).reshape(count * len(offsets), dimension)
     if count == 1:
         values = function(flat)
     else:

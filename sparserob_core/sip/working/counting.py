@@ -118,7 +118,7 @@ def prices_of(program: SemiInfiniteProgram) -> Array:
 
 
 @shaped
-def acting(coefficients: Float[Array, "m n"], values: Float[Array, "n k"]) -> np.ndarray:
+def find_acting_entries(coefficients: Float[Array, "m n"], values: Float[Array, "n k"]) -> np.ndarray:
     """Return where ``coefficients @ values`` is not 0, except for the rounding of the sum.
 
     Parameters
@@ -145,7 +145,7 @@ def counting(program: SemiInfiniteProgram) -> int:
     return program.n if base.S is None else int(np.unique(base.S.tocsr()[:images].indices).size)
 
 
-def completed(program: SemiInfiniteProgram, entries: Array) -> Array:
+def complete_decision(program: SemiInfiniteProgram, entries: Array) -> Array:
     """Return the decision ``(n,)`` that begins with ``entries``, and whose others are as small as bounds of images
     allow."""
     base, size = program.finite, entries.size
@@ -194,7 +194,7 @@ def share_of(program: SemiInfiniteProgram, counted: float) -> float:
     return float(np.rint(counted / price) / prices.size if price else counted / math.fsum(prices))
 
 
-def whole(program: SemiInfiniteProgram, least: float) -> float:
+def round_up_count(program: SemiInfiniteProgram, least: float) -> float:
     """Return the smallest count of at least ``least``, except for rounding, where all prices are equal.
 
     Parameters
@@ -221,7 +221,7 @@ def _find_common_price(prices: Array) -> float:
     return float(prices.mean()) if prices.size and np.ptp(prices) <= NEGLIGIBLE_ENTRY * prices.max() else 0.0
 
 
-def tidied(program: SemiInfiniteProgram, x: Array) -> Array:
+def tidy_decision(program: SemiInfiniteProgram, x: Array) -> Array:
     """Return the decision ``x (n,)`` with entries of ``S x`` that are nearly 0, or nearly at a bound, moved there.
 
     Only entries that count are moved to 0. Where the count would not fall, or the program is too large, ``x`` itself is
@@ -252,7 +252,7 @@ def tidied(program: SemiInfiniteProgram, x: Array) -> Array:
     return candidate if count(program, candidate) < count(program, x) else x
 
 
-def met(program: SemiInfiniteProgram, x: Array, G: Array, h: Array) -> Array:
+def meet_equalities(program: SemiInfiniteProgram, x: Array, G: Array, h: Array) -> Array:
     """Return the decision ``x (n,)`` with its equalities, and the rows ``G x = h``, satisfied to rounding.
 
     Only entries that are neither 0 nor at a bound are changed. The rows are those that an earlier decision satisfied

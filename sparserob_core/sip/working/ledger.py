@@ -25,7 +25,7 @@ from sparserob_core.sip.program import (
     WorstConstraint,
 )
 from sparserob_core.sip.proof.branch_and_bound import MAX_PROOF_CELLS, more, prove
-from sparserob_core.sip.proof.verdict import as_bad_as_found, infeasible_subsystem, verdict, witness, worst_of
+from sparserob_core.sip.proof.verdict import include_found_violation, infeasible_subsystem, verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 from sparserob_core.sip.result import MEANING, Result, Status, relative_gap
 
@@ -54,7 +54,7 @@ class Close(Protocol):
 Found: TypeAlias = Sequence[tuple[ConstraintFamily, Separation]]
 
 
-def unproven(x: Array, cells: int = MAX_PROOF_CELLS) -> Sequence[Proof]:
+def prove_nothing(x: Array, cells: int = MAX_PROOF_CELLS) -> Sequence[Proof]:
     """Return no proof: the prover of a program of which only the bounds are needed."""
     return ()
 
@@ -362,7 +362,7 @@ class Ledger:
         except KeyboardInterrupt:
             meaning = MEANING["undecided"]
             proven = [Proof(family.name, "undecided", np.inf, reason=meaning) for family in self.program.families]
-        proofs = as_bad_as_found(proven, self._separations)
+        proofs = include_found_violation(proven, self._separations)
         return self.judged(self.best, worst_of(self._separations), proofs, reason)
 
     def without(self, answer: CheckedAnswer) -> Result:
@@ -373,9 +373,9 @@ class Ledger:
         solution = answer.solution
         if solution.status != "infeasible":
             return self.result("failed", solution.message, answer)
-        from sparserob_core.sip.proof.irreducible import irreducible
+        from sparserob_core.sip.proof.irreducible import find_irreducible_rows
 
-        rows, solution, shown = irreducible(self.relaxed, answer.rows, solution)
+        rows, solution, shown = find_irreducible_rows(self.relaxed, answer.rows, solution)
         answer = replace(answer, rows=rows, solution=solution)
         amount = solution.infeasibility
         subsystem, worst = infeasible_subsystem(self.relaxed.program, rows, solution.y, amount, shown)
@@ -545,7 +545,7 @@ def _choose_units(lower: Array, upper: Array) -> Array:
     return np.where(np.isfinite(units), units, 0.0)
 
 
-def above(family: ConstraintFamily, found: Separation) -> tuple[Array, np.ndarray, str]:
+def select_violated(family: ConstraintFamily, found: Separation) -> tuple[Array, np.ndarray, str]:
     """Return the violations of a family that are more than the search may leave to the proof.
 
     Parameters

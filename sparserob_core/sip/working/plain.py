@@ -20,7 +20,7 @@ from sparserob_core.sip.proof.verdict import worst_of
 from sparserob_core.sip.relaxed.relaxed import Rows, rows_at, rows_of
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.counting import count, met, tidied
+from sparserob_core.sip.working.counting import count, meet_equalities, tidy_decision
 from sparserob_core.sip.working.ledger import (
     SEARCH_TOLERANCE,
     CheckedAnswer,
@@ -29,7 +29,7 @@ from sparserob_core.sip.working.ledger import (
     Ledger,
     Prover,
     Violated,
-    above,
+    select_violated,
 )
 from sparserob_core.sip.working.working import LargestViolation, Working, fits
 
@@ -302,19 +302,27 @@ class PlainRows(Working):
         if program.activity is None or (number > SPARSIFYING and answer.epsilon == 0.0):
             return answer, found, ()
         active, closed = answer.rows.G[answer.multipliers > 0.0], not ledger.open(x)
-        candidates = [met(program, tidied(program, x), active, active @ x)]  # small entries may keep the gap open
+        candidates = [
+            meet_equalities(program, tidy_decision(program, x), active, active @ x)
+        ]  # small entries may keep the gap open
         if closed and answer.epsilon == 0.0 and program.finite.P is None and program.blocks is None:
             rows = answer.rows
             finite = ledger.relaxed.finite(rows.G, rows.h - self.margin * rows.norms, 0.0)
             corner = vertex(finite, answer.solution.y, answer.solution.mu)
-            candidates += [] if corner is None else [met(program, tidied(program, corner), active, active @ corner)]
+            candidates += (
+                []
+                if corner is None
+                else [meet_equalities(program, tidy_decision(program, corner), active, active @ corner)]
+            )
         kept, violated, least = (answer, found), list[tuple[Array, np.ndarray, str]](), count(program, x)
         for candidate in candidates:
             if candidate is x or count(program, candidate) >= least or not fits(ledger, candidate):
                 continue
             separations = separate(program, candidate, ledger.tools, SEARCH_TOLERANCE, number)
             violations = [
-                constraints for family, separation in separations if (constraints := above(family, separation))[1].size
+                constraints
+                for family, separation in separations
+                if (constraints := select_violated(family, separation))[1].size
             ]
             room = 0.5 * min(0.0, worst_of(found).violation)
             if self.allowed and worst_of(separations).violation > room:

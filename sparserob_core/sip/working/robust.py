@@ -21,7 +21,7 @@ from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.inner.simplex.counterpart import Counterpart, RobustAnswer, robust_bound
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, WorstConstraint
-from sparserob_core.sip.proof.verdict import MAX_NAMED_REASONS, explained
+from sparserob_core.sip.proof.verdict import MAX_NAMED_REASONS, add_facts
 from sparserob_core.sip.relaxed.relaxed import Rows
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
@@ -34,8 +34,8 @@ from sparserob_core.sip.working.ledger import (
     Ledger,
     Prover,
     Violated,
-    above,
-    unproven,
+    prove_nothing,
+    select_violated,
 )
 from sparserob_core.sip.working.tightening import GLANCE, SPARED
 from sparserob_core.sip.working.working import LargestViolation, Working, size_of
@@ -179,7 +179,7 @@ class RobustRows(Working):
             return
         assert self.close is not None
         self.guided, (guide, shared) = True, program.guide
-        result = self.close(guide, replace(tools, notify=ignore), unproven)
+        result = self.close(guide, replace(tools, notify=ignore), prove_nothing)
         self.calls += Counter(result.solved_by)
         tools.deadline.check()
         if result.decision is None:
@@ -450,7 +450,7 @@ class RobustRows(Working):
         The choice is among decisions whose cost is at most the lower bound plus half of the tolerance.
         """
         second, x = self.program.among, answer.solution.x
-        violated = any(above(*pair)[1].size for pair in found)
+        violated = any(select_violated(*pair)[1].size for pair in found)
         if second is None or second[0].n > MAX_SECOND_VARIABLES or violated or ledger.open(x):
             return answer, found, ()
         if not ledger.prove(answer, found, prover(x, GLANCE)):
@@ -459,7 +459,7 @@ class RobustRows(Working):
         if decision is None or self.program.finite.residual(decision) > TOLERANCE or ledger.open(decision):
             return answer, found, ()
         separations = separate(self.program, decision, ledger.tools, SEARCH_TOLERANCE, number)
-        if any(above(*pair)[1].size for pair in separations):
+        if any(select_violated(*pair)[1].size for pair in separations):
             return answer, found, ()
         return self._replace_decision(answer, decision), separations, ()
 
@@ -487,7 +487,7 @@ class RobustRows(Working):
                 return None
             x = np.clip(solution.x, second.finite.lower, second.finite.upper)
             x = x if second.settle is None else second.settle(x)
-            violated = [above(*pair) for pair in separate(second, x, tools, SEARCH_TOLERANCE, number)]
+            violated = [select_violated(*pair) for pair in separate(second, x, tools, SEARCH_TOLERANCE, number)]
             violated += self._find_violated(second, x)
             if not (working.impose(violated) or counterpart.sharpen(x)):
                 break
@@ -537,4 +537,4 @@ def _describe_infeasibility(
         decides="policy",
         irreducible=False,
     )
-    return subsystem, explained(program, bare)
+    return subsystem, add_facts(program, bare)

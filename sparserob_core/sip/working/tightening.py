@@ -24,10 +24,10 @@ from sparserob_core.sip.working.ledger import (
     Ledger,
     Prover,
     Violated,
-    above,
+    select_violated,
     witnesses,
 )
-from sparserob_core.sip.working.working import LargestViolation, Working, left_open
+from sparserob_core.sip.working.working import LargestViolation, Working, collect_open_violations
 
 # Number of cells of a short proof. With a tenth, ordinary problems with parameters need a tightened decision although a
 # proof is quick; with ten times as many, a first upper bound along a constraint takes ten times longer.
@@ -97,8 +97,10 @@ def proofs_of(
     proofs = prover(x, GLANCE // 4 if ledger.tools.deadline.bounded else GLANCE)
     if ledger.prove(answer, found, proofs) or not proofs:
         return proofs, False
-    violations, imposed = left_open(ledger.program, proofs), False
-    is_violated = any(above(*pair)[1].size for pair in found)  # then the rounds are used up, and no more may follow
+    violations, imposed = collect_open_violations(ledger.program, proofs), False
+    is_violated = any(
+        select_violated(*pair)[1].size for pair in found
+    )  # then the rounds are used up, and no more may follow
     if violations and not is_violated and not _is_proven_cheaply(ledger):
         imposed = _tighten(working, ledger, prover, answer, violations, witnesses(ledger.program, proofs))
     # Without cells, another proof would be the same one.
@@ -144,7 +146,7 @@ def tighten_in_time(
     if candidate is not None and ledger.cheaper(candidate):
         x = candidate.solution.x
         ledger.prove(candidate, separate(ledger.program, x, ledger.tools, SEARCH_TOLERANCE), prover(x, GLANCE))
-    violations, violated = [LargestViolation.of(*pair) for pair in found], [above(*pair) for pair in found]
+    violations, violated = [LargestViolation.of(*pair) for pair in found], [select_violated(*pair) for pair in found]
     is_near = working.due_count == 0
     if deadline.left is None:  # with nothing left to impose, the proof of this decision follows at once
         is_near = is_near and (ledger.open(answer.solution.x) or any(rows.size for _, rows, _ in violated))
@@ -189,14 +191,14 @@ def back_off(working: Working, ledger: Ledger, prover: Prover, answer: CheckedAn
     """
     x, program = answer.solution.x, ledger.program
     violations = [LargestViolation.of(*pair) for pair in found if not pair[0].defines]
-    violated: Violated = [above(*pair) for pair in found]
+    violated: Violated = [select_violated(*pair) for pair in found]
     if not ledger.cheaper(answer) or not _is_near(working, program, answer, violations):
         return
     if not any(rows.size for _, rows, _ in violated):
         proofs = prover(x, GLANCE)
         if ledger.prove(answer, found, proofs):
             return
-        violations, violated = left_open(program, proofs), witnesses(program, proofs)
+        violations, violated = collect_open_violations(program, proofs), witnesses(program, proofs)
         if not violations or not _is_near(working, program, answer, violations):
             return
     trial_ledger = replace(ledger)
@@ -206,7 +208,7 @@ def back_off(working: Working, ledger: Ledger, prover: Prover, answer: CheckedAn
         ledger.prove(replace(proven_answer, value=answer.value), separations, proofs)
 
 
-def or_proven(ledger: Ledger, result: Result) -> Result:
+def prefer_proven(ledger: Ledger, result: Result) -> Result:
     """Return the result, or that of the proven decision where the result is not proven."""
     if result.status not in ("refuted", "undecided") or ledger.proven is None:
         return result
@@ -289,7 +291,7 @@ def _tighten(
         if violations:
             continue
         proofs = prover(x, cells)
-        violations, violated = left_open(program, proofs), witnesses(program, proofs)
+        violations, violated = collect_open_violations(program, proofs), witnesses(program, proofs)
         if ledger.prove(tighter, separations, proofs) or not violations:
             return imposed > 0
         if cells == GLANCE:
@@ -329,7 +331,7 @@ def _separate_violations(ledger: Ledger, x: Array) -> tuple[Found, Sequence[Larg
     return (
         separations,
         [LargestViolation.of(*pair) for pair in violated_pairs],
-        [above(*pair) for pair in violated_pairs],
+        [select_violated(*pair) for pair in violated_pairs],
     )
 
 

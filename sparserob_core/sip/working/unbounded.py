@@ -24,7 +24,15 @@ from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import rows_of
 from sparserob_core.sip.result import Result, Status
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.ledger import SEARCH_TOLERANCE, Close, Ledger, Prover, Violated, above, unproven
+from sparserob_core.sip.working.ledger import (
+    SEARCH_TOLERANCE,
+    Close,
+    Ledger,
+    Prover,
+    Violated,
+    prove_nothing,
+    select_violated,
+)
 
 SPENT = 1e-12  # of a bound: what it loses for multipliers of rows without one; ten times less is lost in rounding
 NO_FALL = 1e-12  # of the largest coefficient: fall of the cost per unit of a direction that is certainly rounding
@@ -174,7 +182,7 @@ def bounding_rows(
     rows, is_bounded = _collect_rows(recession, steps, _group_by_family(start), NO_FALL * coefficient)
     if is_bounded:
         return None, rows
-    result = close(recession, steps, unproven, rows)
+    result = close(recession, steps, prove_nothing, rows)
     if result.decision is not None and not result.stopped and result.cost < -FALLS * coefficient:
         return result.decision / np.abs(result.decision).max(), []
     return None, _group_by_family(result.history[-1].imposed if result.history else ())
@@ -198,7 +206,8 @@ def _collect_rows(
         if recession.cost(corner.x) >= -fall:
             return chosen, True
         violated = [
-            above(*pair) for pair in separate(recession, corner.x, replace(tools, budget=0), SEARCH_TOLERANCE, number)
+            select_violated(*pair)
+            for pair in separate(recession, corner.x, replace(tools, budget=0), SEARCH_TOLERANCE, number)
         ]
         fresh = [entry for entry in violated if entry[1].size]
         if not fresh:

@@ -18,7 +18,15 @@ from sparserob_core.sip.evidence import Dual, Proof
 from sparserob_core.sip.program import EQUALITY, ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.result import SMALL_COST, Result
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.ledger import SEARCH_TOLERANCE, CheckedAnswer, Found, Ledger, Prover, Violated, above
+from sparserob_core.sip.working.ledger import (
+    SEARCH_TOLERANCE,
+    CheckedAnswer,
+    Found,
+    Ledger,
+    Prover,
+    Violated,
+    select_violated,
+)
 
 # The least positive margin, and the largest, in units of the decision's bounds where those are below 1. The least is
 # the rounding of rows: five times as much costs most of the tolerated gap where multipliers are a million; less has no
@@ -287,7 +295,7 @@ class Working(ABC):
             return answer, found
         all_separations = separate(self.program, decision, ledger.tools, SEARCH_TOLERANCE, number)
         separations = [pair for pair in all_separations if not pair[0].defines]
-        if any(above(*pair)[1].size for pair in separations):
+        if any(select_violated(*pair)[1].size for pair in separations):
             return answer, found
         solution = replace(answer.solution, x=decision, value=cost, gap=cost - answer.solution.lower_bound)
         return replace(answer, solution=solution, value=cost), separations
@@ -360,7 +368,7 @@ class Working(ABC):
         """
         if any(proof.verdict == "refuted" for proof in proofs) or not self.slater:
             return False
-        violations = left_open(self.program, proofs)
+        violations = collect_open_violations(self.program, proofs)
         if not violations and ledger.is_excuse_dear(answer.solution.x, proofs):
             violations = [_make_excuse(proof) for proof in proofs if proof.bound > 0.0 and proof.index is not None]
         distances = [self.distance(violation) for violation in violations]
@@ -419,7 +427,7 @@ def _make_excuse(proof: Proof) -> LargestViolation:
     return LargestViolation(proof.bound, proof.family, proof.index[None], np.array([proof.row]))
 
 
-def left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[LargestViolation]:
+def collect_open_violations(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[LargestViolation]:
     """Return the violations that proofs could not exclude, each with the index of the largest violation found.
 
     Parameters

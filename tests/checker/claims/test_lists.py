@@ -13,7 +13,7 @@ import sparserob_core as sr
 from sparserob_core.checker.claims import constraints, replay
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.outcome import Broken
-from sparserob_core.control.problem.disturbances import joined
+from sparserob_core.control.problem.disturbances import join_disturbances
 from sparserob_core.control.sets.sets import Box
 from tests.support.worst_cases import (
     BEGUN,
@@ -65,7 +65,7 @@ def case_of(name: str, certificate: dict[str, Any] | None = None, **more: Any) -
             )
             for i, (one, pieces) in enumerate(zip(SETS, LISTS[name], strict=True))
         ]  # fmt: skip
-        system, bound, kinds, own = joined(system, every, HORIZON)
+        system, bound, kinds, own = join_disturbances(system, every, HORIZON)
         said = {"disturbance_class": kinds, "disturbance_breakpoints": own}
     given = {"control": CONTROL, "initial_set": BEGUN, "disturbance": bound, **said, **more}
     problem = sr.OptimalControlProblem(system=system, horizon=HORIZON, initial_state=START, **given)

@@ -17,7 +17,7 @@ from sparserob_core.checker.claims import constraints
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.problem.integrals import integrating
-from sparserob_core.control.transcription.terms.accumulated import accumulated
+from sparserob_core.control.transcription.terms.accumulated import integrals_as_states
 
 TOO_MUCH, NOTHING = 5e-9, 3e-10
 ONE = np.ones((1, 1))
@@ -102,7 +102,7 @@ SYSTEMS: dict[str, dict[str, object]] = {
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_it_makes_the_same_states_of_the_same_records_as_a_transcription(name: str) -> None:
     problem = problem_of(**SYSTEMS[name])
-    mine, theirs = integrating(problem), accumulated(problem)
+    mine, theirs = integrating(problem), integrals_as_states(problem)
     assert mine.system.switches == theirs.system.switches and mine.system.delay == theirs.system.delay
     for one, other in zip(mine.system.forced.modes, theirs.system.forced.modes, strict=True):
         at = one.probes

@@ -9,8 +9,8 @@ from scipy.linalg import expm
 
 import sparserob_core as sr
 from sparserob_core.control.loop import resolving, retuning
-from sparserob_core.control.loop.remaining import remaining
-from sparserob_core.control.loop.resolving import shifted
+from sparserob_core.control.loop.remaining import remaining_problem
+from sparserob_core.control.loop.resolving import shift_cuts
 from sparserob_core.control.studies.adversary import find_adversary
 from sparserob_core.control.transcription.transcribe import in_own_units
 from sparserob_core.sip.proof.branch_and_bound import prove
@@ -218,9 +218,9 @@ def test_a_plan_that_was_solved_anew_offers_its_program_from_the_measured_state(
 def test_under_feedback_what_is_left_begins_with_the_times_that_mattered(plans, name) -> None:
     plan = sr.controller(plans[name]).plan
     gap = float(plan.known.control.breakpoints[2])
-    program = remaining(plan.known, 2, np.array([-0.5, 0.5]), None).program.own_units.program
+    program = remaining_problem(plan.known, 2, np.array([-0.5, 0.5]), None).program.own_units.program
     times = np.array([cut.index[0] for cut in plan.cuts if cut.family == "path"])
-    found = shifted(plan.cuts, gap, program)
+    found = shift_cuts(plan.cuts, gap, program)
     assert found or (times < gap).all()
     for indices, _, family in found:
         one = program.family(family)
@@ -232,10 +232,10 @@ def test_under_feedback_what_is_left_begins_with_the_times_that_mattered(plans, 
 def test_what_is_left_at_the_beginning_is_the_problem_itself(plans) -> None:
     for outcome in plans.values():
         model = outcome.experiment.transcription
-        whole = remaining(model, 0, np.array([-1.0, 1.0]), None)
+        whole = remaining_problem(model, 0, np.array([-1.0, 1.0]), None)
         assert whole.program.cost(outcome.result.decision) == pytest.approx(outcome.result.cost)
         assert [one.name for one in whole.constraints] == [one.name for one in model.constraints]
-        late = remaining(model, 6, np.zeros(2), None)
+        late = remaining_problem(model, 6, np.zeros(2), None)
         assert late.problem.horizon == pytest.approx(1.5)
         assert late.problem.path[0].start == 0.0
         assert [one.name for one in late.constraints] == [one.name for one in model.constraints]
@@ -451,7 +451,9 @@ def test_with_a_limit_nothing_is_written_down_and_nothing_hopeless_begun_in_a_st
     assert outcome.status == "certified"
     written, begun = [], []
     for module in (resolving, retuning):
-        monkeypatch.setattr(module, "remaining", lambda *a, **k: (written.append(a[1]), remaining(*a, **k))[1])
+        monkeypatch.setattr(
+            module, "remaining_problem", lambda *a, **k: (written.append(a[1]), remaining_problem(*a, **k))[1]
+        )
     monkeypatch.setattr(resolving, "in_own_units", lambda model: (begun.append(model), in_own_units(model))[1])
     controller = sr.controller(outcome, True, seconds=1e-6)
     assert written  # before the first step
@@ -468,6 +470,8 @@ def test_with_a_limit_nothing_is_written_down_and_nothing_hopeless_begun_in_a_st
 
 def test_a_limit_that_is_long_enough_is_used(plans, monkeypatch) -> None:
     controller, written = sr.controller(plans["nominal"], True, seconds=1e6), []
-    monkeypatch.setattr(resolving, "remaining", lambda *a, **k: (written.append(a[1]), remaining(*a, **k))[1])
+    monkeypatch.setattr(
+        resolving, "remaining_problem", lambda *a, **k: (written.append(a[1]), remaining_problem(*a, **k))[1]
+    )
     controller.step(0.0, np.array([-1.0, 1.0]))
     assert written == [0]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.loop.tracking import KEPT, MIN_LEVEL, PARTS, Tracking, trackable
+from sparserob_core.control.loop.tracking import KEPT, MIN_LEVEL, PARTS, Tracking, is_trackable
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.transcription.transcribe import from_state, in_own_units, prepare
 from sparserob_core.sip.program import TOLERANCE
@@ -43,7 +43,7 @@ VARIANTS = {
 @pytest.mark.parametrize("name", VARIANTS)
 def test_it_proves_and_finds_what_the_exchange_does(name) -> None:
     own, units = spring(**VARIANTS[name])
-    assert trackable(own)
+    assert is_trackable(own)
     tracking, rng = Tracking(own), np.random.default_rng(0)
     for _ in range(6):
         state = (np.array([-1, 1]) + 0.05 * rng.standard_normal(2)) / units.states
@@ -153,5 +153,5 @@ def test_without_a_row_that_mattered_it_begins_with_none() -> None:
 
 
 def test_what_it_does_not_know_it_leaves_to_the_exchange() -> None:
-    assert not trackable(spring(control_step=sr.Box([-0.2], [0.2]))[0])
-    assert not trackable(spring(initial_set=sr.Box([-0.1, -0.1], [0.1, 0.1]))[0])
+    assert not is_trackable(spring(control_step=sr.Box([-0.2], [0.2]))[0])
+    assert not is_trackable(spring(initial_set=sr.Box([-0.1, -0.1], [0.1, 0.1]))[0])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.problem.tracing import traced
+from sparserob_core.control.problem.tracing import trace_entries
 from sparserob_core.sip.expressions.expression import parse_matrix
 
 NAMES = ("p1", "p2")
@@ -27,7 +27,7 @@ PROBES = np.array([[0.3, 0.7], [0.9, 0.2]])
     ],
 )
 def test_the_expressions_of_a_function_have_its_values(function: Callable[..., object]) -> None:
-    written = parse_matrix("A", traced("A", function, NAMES, PROBES), NAMES)
+    written = parse_matrix("A", trace_entries("A", function, NAMES, PROBES), NAMES)
     for point in np.random.default_rng(0).uniform(0.1, 1.0, (50, 2)):
         assert np.allclose(written(point), np.asarray(function(point), dtype=float), rtol=1e-14, atol=0.0)
 
@@ -55,4 +55,4 @@ def remembers() -> Callable[..., object]:
 )
 def test_what_is_no_arithmetic_is_refused_with_its_reason(function: Callable[..., object], why: str) -> None:
     with pytest.raises(sr.InputError, match=why):
-        traced("A", function, NAMES, PROBES)
+        trace_entries("A", function, NAMES, PROBES)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.problem.disturbances import joined
+from sparserob_core.control.problem.disturbances import join_disturbances
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from sparserob_core.control.problem.terms.windows import PathConstraint
@@ -74,7 +74,7 @@ def program(name: str) -> Any:
             for i, (one, kind, pieces) in enumerate(zip(LIST, more.pop("list"), more.pop("own"), strict=True))
         ]
         names = "system", "disturbance", "disturbance_class", "disturbance_breakpoints"
-        more |= dict(zip(names, joined(more.get("system", PLAIN), every, HORIZON), strict=True))
+        more |= dict(zip(names, join_disturbances(more.get("system", PLAIN), every, HORIZON), strict=True))
     path = [*FLAT[:2], *([] if "late" in name else [FLAT[2]])]
     path.append(PathConstraint(Ellipsoid(np.zeros(2), [[3.0, 0.5], [0.5, 4.0]]), 0.15, 1.85, "curved"))
     made = OptimalControlProblem(

@@ -16,7 +16,7 @@ from sparserob_core.control.problem.system import System, VaryingSystem
 from sparserob_core.control.reach.execution import Execution
 from sparserob_core.control.reach.varying_execution import VaryingExecution, VaryingExecutionCellSupport
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
-from sparserob_core.control.sets.integrals import absolute
+from sparserob_core.control.sets.integrals import enclose_absolute_integrals
 from sparserob_core.control.transcription.transcribe import Transcription, prepare
 from sparserob_core.sip.convex_set import Array
 from tests.support.enclosed import assert_bounded_on_cells
@@ -243,7 +243,7 @@ def test_integrals_of_absolute_values_are_enclosed_whatever_signs_the_polynomial
     terms[0], terms[1] = 0.0, np.eye(9)[1] - 0.25 * np.eye(9)[0]  # nothing, and u - 1/4, of which |.| is 5/16
     terms[2] = 0.25 * np.eye(9)[0] - np.eye(9)[1] + np.eye(9)[2]  # (u - 1/2)^2, which changes no sign
     sizes = np.abs(terms).sum(axis=1)
-    found = absolute(terms, np.maximum(1e-14 * sizes, 1e-300))
+    found = enclose_absolute_integrals(terms, np.maximum(1e-14 * sizes, 1e-300))
     points = (np.arange(40_000) + 0.5) / 40_000
     sampled = np.abs(np.polynomial.polynomial.polyval(points, terms.T)).mean(axis=1)
     assert (np.abs(found - sampled[:, None]) <= 1e-7).all()

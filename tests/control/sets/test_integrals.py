@@ -9,7 +9,7 @@ from math import comb
 import numpy as np
 import pytest
 
-from sparserob_core.control.sets.integrals import _split_polynomials, curved_integral, enclosed
+from sparserob_core.control.sets.integrals import _split_polynomials, can_enclose_integrals, curved_integral
 from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid, NormBall, Polytope, Zonotope, product
 from sparserob_core.sip.convex_set import ScaledSet
 from tests.control.sets.test_sets import ByItsSupport
@@ -71,7 +71,7 @@ def test_what_a_support_function_is_continued_to_is_no_larger_than_is_said(name:
     most = bound.continued(centre, spread)
     assert most is not None
     finite = np.isfinite(most)
-    assert finite.sum() > 20 and enclosed(bound)
+    assert finite.sum() > 20 and can_enclose_integrals(bound)
     for turn in np.exp(2j * np.pi * rng.uniform(size=(8, bound.dimension))):
         # by its series about the centre along the way: a mean over a circle of real directions would need it as well
         s = np.cos(np.pi * (np.arange(24) + 0.5) / 24)
@@ -101,8 +101,8 @@ def test_where_a_root_or_an_absolute_value_may_be_0_nothing_is_continued() -> No
     assert analytic(corners, [1.0, 0.5], [0.24, 0.24]) and not analytic(corners, [1.0, 0.5], [0.26, 0.26])
     segments = Zonotope(np.zeros(2), np.array([[1.0, 0.0], [1.0, 1.0]]))
     assert analytic(segments, [1.0, 0.5], [0.2, 0.2]) and not analytic(segments, [1.0, -0.5], [0.3, 0.3])
-    assert enclosed(product([ball, segments])) and not enclosed(ByItsSupport(ball))
-    assert not enclosed(ScaledSet(ByItsSupport(ball), np.zeros(2), 0.5))
+    assert can_enclose_integrals(product([ball, segments])) and not can_enclose_integrals(ByItsSupport(ball))
+    assert not can_enclose_integrals(ScaledSet(ByItsSupport(ball), np.zeros(2), 0.5))
 
 
 def test_of_a_ball_that_is_a_point_nothing_moves() -> None:

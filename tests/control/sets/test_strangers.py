@@ -8,7 +8,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.control.sets.strangers import require_consistent, strangers
-from sparserob_core.control.transcription.provable import remark
+from sparserob_core.control.transcription.provable import unproven_assumptions
 
 
 def norm(c):
@@ -99,7 +99,7 @@ def test_a_set_is_looked_at_wherever_it_stands(place):
         problem(**PLACES[place](low))
     made = problem(**PLACES[place](Stranger()))
     assert "stranger" in {one.kind for one in strangers(made)}
-    assert "what sets of the kind stranger say of themselves is believed" in remark(made)
+    assert "what sets of the kind stranger say of themselves is believed" in unproven_assumptions(made)
 
 
 def test_a_set_of_a_plugin_that_is_a_file_is_one_of_others(tmp_path):
@@ -119,7 +119,7 @@ def test_a_set_of_a_plugin_that_is_a_file_is_one_of_others(tmp_path):
 
 def test_sets_of_this_distribution_are_known():
     made = problem(disturbance=sr.Ellipsoid([0.0, 0.0], np.eye(2)), path=[sr.Box([-3.0] * 2, [3.0] * 2)])
-    assert not list(strangers(made)) and remark(made) == ""
+    assert not list(strangers(made)) and unproven_assumptions(made) == ""
 
 
 def test_a_set_that_is_unbounded_is_looked_at_where_it_is_finite():

@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import expm
 
 import sparserob_core as sr
-from sparserob_core.control.studies.horizons import Horizons, Multiplier, at_horizon, stretched
+from sparserob_core.control.studies.horizons import Horizons, Multiplier, shorten_horizon, stretch_dictionary
 
 PIECES = 6
 LONGEST = 4.0
@@ -95,8 +95,8 @@ def test_a_row_whose_window_has_not_begun_counts_for_nothing():
 
 def test_a_shorter_horizon_keeps_windows_in_absolute_time_and_the_number_of_pieces():
     of = problem("known", np.random.default_rng(2))
-    assert at_horizon(of, 2.0).path[0].start == 0.7 and at_horizon(of, 2.0).path[0].stop == 2.0
-    assert at_horizon(of, 0.7).path[0].start == at_horizon(of, 0.7).path[0].stop == 0.7
-    assert not at_horizon(of, 0.6).path
-    uneven = stretched(sr.Dictionary([0.0, 1.0, 4.0], np.eye(2)), 2.0)
+    assert shorten_horizon(of, 2.0).path[0].start == 0.7 and shorten_horizon(of, 2.0).path[0].stop == 2.0
+    assert shorten_horizon(of, 0.7).path[0].start == shorten_horizon(of, 0.7).path[0].stop == 0.7
+    assert not shorten_horizon(of, 0.6).path
+    uneven = stretch_dictionary(sr.Dictionary([0.0, 1.0, 4.0], np.eye(2)), 2.0)
     np.testing.assert_array_equal(uneven.breakpoints, [0.0, 0.5, 2.0])

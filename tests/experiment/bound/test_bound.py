@@ -12,7 +12,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.control.studies.suprema import rows_of
-from sparserob_core.control.transcription.terms.accumulated import accumulated
+from sparserob_core.control.transcription.terms.accumulated import integrals_as_states
 from sparserob_core.experiment.bound.record import list_bound_columns, list_bound_rows
 from tests.support.places import matrices, needs_plants
 
@@ -211,7 +211,7 @@ def test_rows_at_corners_of_parameters_beside_the_time_are_told_as_one_quantity(
         control=sr.Box([-1], [1]),
         terminal=[sr.Polytope([[1.0, 0.0], [1.0, 1.0]], [5.0, 5.0])],
     )
-    larger = accumulated(stated)
+    larger = integrals_as_states(stated)
     corners = larger.names.corners
     assert corners is not None
     told = [(row.quantity(larger), corners.at(row.direction)) for row in rows_of(larger)]

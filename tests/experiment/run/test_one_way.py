@@ -89,7 +89,7 @@ def test_a_run_with_feedback_and_one_without_go_one_way(tmp_path: Path) -> None:
         "sip.methods.exchange.Rounds.step",
         "control.transcription.transcribe.prepare",
         "control.transcription.transcribe._build_own_units",
-        "control.transcription.program.transcribed",
+        "control.transcription.program.build_program",
         "control.transcription.program.compute_conversion_factors",
         "control.transcription.telling.Telling.family",
         "checker.claims.multipliers._derive_base_row",

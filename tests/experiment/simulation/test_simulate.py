@@ -22,7 +22,7 @@ from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.sets.sets import NormBall, Polytope
 from sparserob_core.control.studies.laws import Uncertainty
-from sparserob_core.control.studies.simulate import fine_times, finer, simulate_states, times_inside
+from sparserob_core.control.studies.simulate import fine_times, refine_grid, simulate_states, times_inside
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.simulation.simulation import clopper_pearson
 from tests.support.plants import held, indicators, random_system, simulated, uniform, walsh
@@ -225,7 +225,7 @@ def test_trajectories_agree_with_an_integrator_and_with_augmented_exponentials(n
         model = prepare(problem, control, disturbance)
         u, w = rng.normal(size=(2, pieces)), rng.normal(size=(3, 2, 2))
         times = fine_times(model.response, ParameterIndex(None), np.array([0.123]))
-        fine = Response(system, finer(model.response.grid, times), model.response.initial_state)
+        fine = Response(system, refine_grid(model.response.grid, times), model.response.initial_state)
         grid = model.response.grid
         paths = np.stack(
             list(simulate_states(fine, u[:, grid.control_piece], np.zeros((3, 0)), w[:, :, grid.disturbance_piece]))
@@ -268,7 +268,7 @@ def test_every_trajectory_has_its_own_parameter():
     paths = np.stack(
         list(
             simulate_states(
-                Response(model.response.system, finer(grid, grid.breakpoints), model.response.initial_state),
+                Response(model.response.system, refine_grid(grid, grid.breakpoints), model.response.initial_state),
                 u[:, grid.control_piece],
                 parameters,
                 disturbances,

@@ -8,7 +8,7 @@ from scipy.sparse import csc_array
 
 import sparserob_core as sr
 from sparserob_core.sip.finite import FiniteProgram
-from sparserob_core.sip.inner.change_of_variables import DIRECTIONS, LARGE, in_new_variables
+from sparserob_core.sip.inner.change_of_variables import DIRECTIONS, LARGE, change_variables
 from sparserob_core.sip.inner.duality import dual_bound, measure
 from sparserob_core.sip.inner.solve import solve_finite
 
@@ -40,7 +40,7 @@ def growing(horizon: float, *, fixed: bool = False, near: float = 1e-3) -> Finit
 @pytest.mark.parametrize("fixed", [False, True])
 def test_rows_that_grow_are_divided_into_ordinary_numbers(fixed: bool) -> None:
     program = growing(2.5, fixed=fixed)
-    easier = in_new_variables(program)
+    easier = change_variables(program)
     assert easier is not None and easier.divided is not None
     assert np.linalg.norm(program.G, axis=1).max() > 1e4
     assert np.linalg.norm(easier.program.G, axis=1).max() < LARGE
@@ -51,7 +51,7 @@ def test_rows_that_grow_are_divided_into_ordinary_numbers(fixed: bool) -> None:
 @pytest.mark.parametrize("fixed", [False, True])
 def test_the_divided_program_says_the_same_of_decisions_and_multipliers(fixed: bool) -> None:
     program, rng = growing(2.0, fixed=fixed), np.random.default_rng(0)
-    easier = in_new_variables(program)
+    easier = change_variables(program)
     assert easier is not None
     x, y = rng.uniform(-1.0, 1.0, program.n), rng.uniform(0.0, 1.0, program.h.size)
     if fixed:  # along equalities rows are the same where these hold
@@ -96,12 +96,12 @@ def test_more_equalities_than_entries_are_no_directions() -> None:
     A, b = np.array([[1.0, 0.0], [0.0, 1e-5], [2.0, 1.0]]), np.array([0.5, 2e-5, 3.0])
     five = np.full(2, 5.0)
     program = FiniteProgram(np.array([1.0, 0.0]), np.zeros(2), -five, five, np.zeros((0, 2)), np.zeros(0), A, b)
-    assert in_new_variables(program) is None
+    assert change_variables(program) is None
     assert solve_finite(program, SOLVER).value == pytest.approx(0.5)
 
 
 def test_ordinary_rows_are_left_as_they_are() -> None:
-    assert in_new_variables(growing(0.5)) is None
+    assert change_variables(growing(0.5)) is None
 
 
 def test_a_variable_with_a_wide_bound_is_no_direction() -> None:
@@ -118,7 +118,7 @@ def test_a_variable_with_a_wide_bound_is_no_direction() -> None:
         np.zeros((0, 41)),
         program.b,
     )
-    easier = in_new_variables(with_slack)
+    easier = change_variables(with_slack)
     assert easier is None or easier.divided is None
 
 
@@ -128,7 +128,7 @@ def test_a_variable_with_large_coefficients_is_no_direction() -> None:
     G[:, -1] = -1e4 * LARGE
     one = np.ones(n)
     program = FiniteProgram(one, 0.0 * one, -one, one, G, np.ones(20), np.zeros((0, n)), np.zeros(0))
-    assert in_new_variables(program) is None
+    assert change_variables(program) is None
 
 
 @pytest.mark.parametrize(("n", "count"), [(60, DIRECTIONS + 12), (8, 3)])
@@ -136,7 +136,7 @@ def test_many_directions_are_no_few(n: int, count: int) -> None:
     rng = np.random.default_rng(1)
     G = LARGE * rng.standard_normal((count, n))
     one, h = np.ones(n), np.ones(len(G))
-    assert in_new_variables(FiniteProgram(one, 0.0 * one, -one, one, G, h, np.zeros((0, n)), np.zeros(0))) is None
+    assert change_variables(FiniteProgram(one, 0.0 * one, -one, one, G, h, np.zeros((0, n)), np.zeros(0))) is None
 
 
 def test_curvatures_that_differ_by_much_are_made_even() -> None:
@@ -155,7 +155,7 @@ def test_curvatures_that_differ_by_much_are_made_even() -> None:
         np.zeros(0),
         P=csc_array((P + P.T) / 2),
     )
-    easier = in_new_variables(program)
+    easier = change_variables(program)
     assert easier is not None
     x, z = rng.standard_normal(n), rng.standard_normal(n)
     new = easier.to(x)

@@ -16,9 +16,9 @@ from sparserob_core.sip.inner.dual_newton import (
     DualNewton,
     _Dual,
     _solve_non_negative,
-    from_nothing,
     newton_solve,
     not_separable,
+    solve_from_nothing,
 )
 from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.testing.solvers import (
@@ -75,7 +75,7 @@ def separable(seed: int, rows: int, entries: int, curvature: float) -> FinitePro
 @pytest.mark.parametrize("seed", range(4))
 def test_from_nothing_it_finds_the_optimum_to_round_off(seed: int, curvature: float) -> None:
     program = separable(seed, 6, 80, curvature)
-    found, _ = from_nothing(program, 1e-10, 60)
+    found, _ = solve_from_nothing(program, 1e-10, 60)
     assert found.residual <= 1e-10
     assert abs(found.gap) <= 1e-10 * max(1.0, abs(found.value))
     other = solve_finite(program, sr.load_registry().build("solver", "clarabel"))
@@ -153,7 +153,7 @@ def test_active_sets_that_go_round_are_given_up() -> None:
 def test_a_program_that_no_answer_meets_is_not_claimed_to_be_solved() -> None:
     program = separable(0, 6, 80, 0.0)
     apart = replace(program, b=program.b + 1e3)
-    found, _ = from_nothing(apart, 1e-10, 60)
+    found, _ = solve_from_nothing(apart, 1e-10, 60)
     assert found.residual > 1e-3
     assert solve_finite(apart, DualNewton()).status == "infeasible"
 

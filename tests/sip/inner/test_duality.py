@@ -15,16 +15,16 @@ from sparserob_core.sip.inner.duality import (
     ROUND_OFF,
     _clip_multipliers,
     _compute_terms,
+    bound_with_multipliers,
     dual_bound,
     farkas_margin,
     farkas_proof,
-    homogeneous,
     measure,
     minimisers,
-    proving,
-    repaired,
+    remove_cost,
+    repair_multipliers,
+    replace_norms,
     vertex_multipliers,
-    without_norms,
 )
 
 
@@ -85,7 +85,7 @@ def test_a_bound_is_the_dual_function_less_its_own_rounding(kind: str, apart: fl
     for _ in range(6):
         program, y, mu = drawn(rng, kind, apart)
         at = rng.normal(size=program.n) if kind == "bent" else None
-        bound, better, moved, _ = proving(program, y, mu, None, at)
+        bound, better, moved, _ = bound_with_multipliers(program, y, mu, None, at)
         truth = dual(program, _clip_multipliers(program, better), moved, at)
         size = 10.0 * (1.0 + np.abs(y).sum() * (2.0 + 2.0 * program.n) + program.n * 10.0)
         assert Fraction(bound) <= truth
@@ -147,7 +147,7 @@ def test_what_refutes_is_the_dual_function_of_the_rows_alone_per_size_of_the_mul
             bound, magnitude = farkas_margin(program, y, mu)
             y = _clip_multipliers(program, y)
             total = y @ np.linalg.norm(program.G, axis=1) + np.abs(mu) @ np.linalg.norm(program.A, axis=1)
-            truth = float(dual(homogeneous(program), y / total, mu / total))
+            truth = float(dual(remove_cost(program), y / total, mu / total))
             assert truth - 1e-12 <= bound <= truth + 1e-15
             finite = np.isfinite(program.h)
             sizes = (y @ np.abs(np.where(finite, program.h, 0.0)) + np.abs(mu) @ np.abs(program.b)) / total
@@ -179,7 +179,7 @@ def test_norms_of_blocks_are_replaced_by_what_lies_below_them_and_meets_them() -
         program = replace(program, blocks=Blocks(number), weights=weights, lower=-np.ones(n), upper=np.ones(n))
         at = rng.normal(size=n)
         terms = _compute_terms(program, _clip_multipliers(program, y), mu, None, at)
-        plain = without_norms(terms, program)
+        plain = replace_norms(terms, program)
         assert (plain.weights[:2] == 0.0).all() and (plain.weights[2:] == terms.weights[2:]).all()
         offered = (plain.slope - terms.slope)[:2]
         assert np.linalg.norm(offered) <= weights[0] + 1e-15 * np.abs(terms.slope[:2]).sum()
@@ -230,13 +230,13 @@ def test_unbounded_entries_get_the_slopes_that_they_ask_for(bent: bool) -> None:
         y0 = y0 + off * (1.0 + 1e-4 * rng.normal(size=6))
         if (y0[:5] <= 0.01).any():
             continue
-        better = repaired(program, y0[:5], y0[5:], None, at)
+        better = repair_multipliers(program, y0[:5], y0[5:], None, at)
         assert better is not None
         slope = program.q + better[0] @ program.G + better[1] @ program.A
         slope = slope if better[3] is None else slope + program.P @ better[3]
         assert np.abs(slope[:2]).max() < 1e-12
         assert dual_bound(program, *better[:2], None, better[3]) > -np.inf
-        told = proving(program, y0[:5], y0[5:], None, at)
+        told = bound_with_multipliers(program, y0[:5], y0[5:], None, at)
         assert told[0] > -np.inf
 
 

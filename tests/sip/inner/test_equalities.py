@@ -11,7 +11,7 @@ import sparserob_core as sr
 from sparserob_core.checker import outcome
 from sparserob_core.sip import program as sip
 from sparserob_core.sip.finite import FiniteProgram
-from sparserob_core.sip.inner.equalities import onto_equalities
+from sparserob_core.sip.inner.equalities import project_onto_equalities
 
 
 def near(rng: np.random.Generator, image: bool) -> tuple[FiniteProgram, np.ndarray]:
@@ -31,7 +31,7 @@ def near(rng: np.random.Generator, image: bool) -> tuple[FiniteProgram, np.ndarr
 @pytest.mark.parametrize("seed", range(5))
 def test_a_point_that_is_near_meets_its_equalities_and_keeps_its_zeros_and_its_bounds(image, seed):
     program, x = near(np.random.default_rng(seed), image)
-    moved = onto_equalities(program, x)
+    moved = project_onto_equalities(program, x)
     assert program.equality_residual(x) > 1e-12 > 2.0**-50 >= program.equality_residual(moved)
     assert np.abs(moved - x).max() < 1e-8
     before, after = program.image(x), program.image(moved)
@@ -42,10 +42,10 @@ def test_a_point_that_is_near_meets_its_equalities_and_keeps_its_zeros_and_its_b
 def test_a_point_that_is_far_off_or_cannot_move_stays():
     program, x = near(np.random.default_rng(0), image=False)
     far = FiniteProgram(**{**vars(program), "b": program.b + 1.0})
-    assert onto_equalities(far, x) is x
+    assert project_onto_equalities(far, x) is x
     ends = np.sign(x) + (x == 0.0)
     held = FiniteProgram(**{**vars(program), "b": program.A @ ends + 1e-10})
-    np.testing.assert_array_equal(onto_equalities(held, ends), ends)
+    np.testing.assert_array_equal(project_onto_equalities(held, ends), ends)
 
 
 @pytest.mark.parametrize("name", ["piecewise_constant", "walsh"])

@@ -14,7 +14,7 @@ import sparserob_core as sr
 from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.inner.dual_newton import newton_solve, polish
 from sparserob_core.sip.inner.duality import dual_bound, farkas_bound
-from sparserob_core.sip.inner.solve import elastic_program, solve_finite, unrelaxed
+from sparserob_core.sip.inner.solve import elastic_program, interpret_elastic_answer, solve_finite
 from sparserob_core.sip.inner.standard_form import standard_form
 from sparserob_core.testing.solvers import (
     by_linear_programming,
@@ -200,7 +200,7 @@ def test_the_elastic_program_of_a_feasible_one_has_the_value_zero():
     program = to_origin(1, 1)
     relaxed = elastic_program(program)
     assert solve_finite(relaxed, PIQP).value == pytest.approx(0.0, abs=1e-9)
-    x, y, mu, _ = unrelaxed(program, (np.zeros(51), np.arange(4.0), np.zeros(0), None))
+    x, y, mu, _ = interpret_elastic_answer(program, (np.zeros(51), np.arange(4.0), np.zeros(0), None))
     assert (x.size, y.size, mu.tolist()) == (50, 0, [-2.0, -2.0])
 
 

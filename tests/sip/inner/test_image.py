@@ -9,7 +9,7 @@ from scipy.sparse import csc_array, eye_array, vstack
 
 from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.inner.duality import dual_bound
-from sparserob_core.sip.inner.image import CANCELLED_SHARE, onto_stationary, within_bounds
+from sparserob_core.sip.inner.image import CANCELLED_SHARE, move_within_bounds, project_onto_stationary
 
 
 def program(lower: list[float], upper: list[float], S: list[list[float]]) -> FiniteProgram:
@@ -22,14 +22,14 @@ def program(lower: list[float], upper: list[float], S: list[list[float]]) -> Fin
 def test_an_entry_that_may_only_be_0_is_0_and_sums_are_left_alone() -> None:
     S = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -2.0], [1.0, -1.0, 0.0]]
     finite = program([0.0, -1.0, -4.0, 0.0], [0.0, 1.0, 2.0, 0.0], S)
-    moved = within_bounds(finite, np.array([1e-13, 0.5, -1.5]))
+    moved = move_within_bounds(finite, np.array([1e-13, 0.5, -1.5]))
     assert moved.tolist() == [0.0, 0.5, -1.0]  # -2 x3 <= 2; the difference of two entries is not an entry
 
 
 def test_several_images_of_one_entry_bound_it_together() -> None:
     finite = program([-1.0, -3.0], [1.0, 0.5], [[1.0], [-1.0]])
-    assert within_bounds(finite, np.array([-0.9])).tolist() == [-0.5]
-    assert within_bounds(finite, np.array([2.0])).tolist() == [1.0]
+    assert move_within_bounds(finite, np.array([-0.9])).tolist() == [-0.5]
+    assert move_within_bounds(finite, np.array([2.0])).tolist() == [1.0]
 
 
 def slanted(seed: int, sides: int, q: np.ndarray | None = None) -> FiniteProgram:
@@ -51,7 +51,7 @@ def test_a_multiplier_near_its_limit_is_held_there_and_the_others_make_up_for_it
     program = slanted(seed, sides=15)
     rng = np.random.default_rng(seed + 100)
     z = np.concatenate([rng.normal(size=12), dust * np.abs(rng.normal(size=15))])
-    moved = onto_stationary(program, z, program.q)
+    moved = project_onto_stationary(program, z, program.q)
     assert np.abs(program.S.T @ moved + program.q).max() <= 1e-12
     limit = CANCELLED_SHARE * np.abs(moved).max()
     assert moved[12:].min() >= -limit  # below it a side without a lower bound proves nothing
@@ -63,7 +63,7 @@ def test_what_is_stationary_already_but_beyond_its_limit_is_moved_too(seed):
     program = slanted(seed, sides=5)
     z = np.concatenate([np.zeros(12), -np.full(5, 1e-6)])
     z[:12] = -(program.q + program.S[12:].T @ z[12:])
-    moved = onto_stationary(program, z, program.q)
+    moved = project_onto_stationary(program, z, program.q)
     assert np.abs(program.S.T @ moved + program.q).max() <= 1e-12
     assert moved[12:].min() >= -CANCELLED_SHARE * np.abs(moved).max()
 
@@ -75,5 +75,5 @@ def test_multipliers_that_are_off_by_little_are_moved_too(off: float) -> None:
     S, z = finite.S, np.array([0.5, 0.25, -0.4, 0.1])
     assert S is not None
     slope = -(S.T @ z) + off
-    left = np.abs(S.T @ onto_stationary(finite, z, slope) + slope).max()
+    left = np.abs(S.T @ project_onto_stationary(finite, z, slope) + slope).max()
     assert left <= 1e-15

@@ -13,7 +13,7 @@ from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.inner import vertex as module
 from sparserob_core.sip.inner.duality import dual_bound
 from sparserob_core.sip.inner.solve import solve_finite
-from sparserob_core.sip.inner.vertex import sifted, simplex
+from sparserob_core.sip.inner.vertex import simplex, solve_by_sifting
 from sparserob_core.sip.solver import named
 
 
@@ -39,7 +39,7 @@ def test_few_entries_give_the_same_optimum_as_all_of_them(number: int) -> None:
     made = program(rng, number)
     guess = None if number % 2 else np.abs(rng.normal(size=made.h.size))
     with patch.multiple(module, NEAREST=int(rng.integers(5, 100)), NEAREST_SHARE=0.0):
-        found = sifted(made, guess)
+        found = solve_by_sifting(made, guess)
     truth = simplex(made)
     assert found.status == truth.status
     if truth.status != "optimal":

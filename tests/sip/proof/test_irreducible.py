@@ -14,7 +14,7 @@ import sparserob_core as sr
 from sparserob_core.experiment.figures.clash import clash_figure, clash_strips
 from sparserob_core.experiment.figures.style import save_figure
 from sparserob_core.sip.evidence import InfeasibleSubsystem
-from sparserob_core.sip.proof.irreducible import irreducible
+from sparserob_core.sip.proof.irreducible import find_irreducible_rows
 from sparserob_core.sip.proof.verdict import infeasible_subsystem
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
 from tests.support.places import CONFIGS
@@ -62,7 +62,7 @@ def test_without_any_one_row_of_a_clash_something_is_feasible(seed):
     program, rows = half_spaces(seed)
     assert not feasible(rows, 3.0)
     relaxed = RelaxedProgram(program, sr.load_registry().build("solver", "piqp", {}))
-    kept, solution, shown = irreducible(relaxed, rows, relaxed.solve(rows, 0.0))
+    kept, solution, shown = find_irreducible_rows(relaxed, rows, relaxed.solve(rows, 0.0))
     assert shown
     count = kept.h.size
     assert 1 <= count <= 5
@@ -92,7 +92,7 @@ def test_a_proof_by_many_rows_is_made_one_of_few_before_any_is_left_out() -> Non
     relaxed = Counted(program, sr.load_registry().build("solver", "piqp", {}))
     every = replace(relaxed.solve(rows, 0.0), y=np.full(120, 1.0 / 120))  # as an interior point proves it
     asked.clear()
-    kept, solution, _ = irreducible(relaxed, rows, every)
+    kept, solution, _ = find_irreducible_rows(relaxed, rows, every)
     assert 2 <= kept.h.size <= 3
     assert len(asked) <= 6  # of 120 rows one by one
     y = solution.y
@@ -112,7 +112,7 @@ def test_that_all_but_any_one_can_hold_is_said_only_where_a_decision_was_found_f
             return replace(solution, status="failed") if lost and solution.status == "optimal" else solution
 
     relaxed = Lost(program, sr.load_registry().build("solver", "piqp", {}))
-    kept, solution, shown = irreducible(relaxed, rows, relaxed.solve(rows, 0.0))
+    kept, solution, shown = find_irreducible_rows(relaxed, rows, relaxed.solve(rows, 0.0))
     assert kept.h.size > 1 and not feasible(kept, 3.0)
     subsystem, _ = infeasible_subsystem(program, kept, solution.y, solution.infeasibility, shown)
     assert subsystem.irreducible is not lost

@@ -11,7 +11,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Separation, WorstConstraint
-from sparserob_core.sip.proof.verdict import as_bad_as_found, verdict, witness, worst_of
+from sparserob_core.sip.proof.verdict import include_found_violation, verdict, witness, worst_of
 
 
 def proof(said, family="a", violation=-1.0, **more):
@@ -44,22 +44,22 @@ def separated(violation, row=0):
 
 def test_a_refutation_tells_the_worst_that_was_met():
     for said in ("undecided", "refuted"):
-        (worse,) = as_bad_as_found([proof(said, violation=1e-3)], [(family(), separated(0.5, 1))])
+        (worse,) = include_found_violation([proof(said, violation=1e-3)], [(family(), separated(0.5, 1))])
         assert (worse.verdict, worse.violation, worse.index, worse.row) == ("refuted", 0.5, 0.25, 1)
-        (same,) = as_bad_as_found([proof(said, violation=1e-3)], [(family(), separated(1e-3))])
+        (same,) = include_found_violation([proof(said, violation=1e-3)], [(family(), separated(1e-3))])
         assert (same.verdict, same.violation, same.index) == (said, 1e-3, 0.5)
-    (still,) = as_bad_as_found([proof("proven", violation=-1.0)], [(family(), separated(0.5))])
+    (still,) = include_found_violation([proof("proven", violation=-1.0)], [(family(), separated(0.5))])
     assert still.verdict == "proven"
     for violation, said in ((5e-9, "refuted"), (1.01 * TOLERANCE, "refuted"), (TOLERANCE, "undecided")):
-        (found,) = as_bad_as_found([proof("undecided")], [(family(), separated(violation))])
+        (found,) = include_found_violation([proof("undecided")], [(family(), separated(violation))])
         assert found.verdict == said
-    (other,) = as_bad_as_found([proof("undecided")], [(family("b"), separated(0.5))])
+    (other,) = include_found_violation([proof("undecided")], [(family("b"), separated(0.5))])
     assert other.verdict == "undecided"
 
 
 def test_a_violation_is_told_in_the_unit_of_its_row():
     units = np.array([1.0, 100.0])
-    (worse,) = as_bad_as_found([proof("undecided")], [(family(units=units), separated(0.5, 1))])
+    (worse,) = include_found_violation([proof("undecided")], [(family(units=units), separated(0.5, 1))])
     assert worse.unit == 100.0
     assert "50" in verdict([worse], 0.0, 1.0)[1]
 

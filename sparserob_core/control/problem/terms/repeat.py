@@ -38,7 +38,7 @@ class Repeating(Enum):
     IMPOSED = "imposed"
 
 
-def ending(bound: ConvexSet | None, centre: Array, horizon: float) -> tuple[list[Return], list[Equality]]:
+def require_return(bound: ConvexSet | None, centre: Array, horizon: float) -> tuple[list[Return], list[Equality]]:
     """Return the constraints by which a repeating plan ends where it can begin again.
 
     Parameters

@@ -19,9 +19,9 @@ from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.integral import Accumulated, IntegralConstraint
 from sparserob_core.control.sets.sets import Polytope, cylinder
 from sparserob_core.control.term import SAME_TIME
-from sparserob_core.control.transcription.terms.in_time import in_time
-from sparserob_core.control.transcription.terms.larger import larger
-from sparserob_core.control.transcription.terms.superposed import superposed
+from sparserob_core.control.transcription.terms.in_time import follow_in_time
+from sparserob_core.control.transcription.terms.larger import enlarge_problem
+from sparserob_core.control.transcription.terms.superposed import parameters_as_states
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 
@@ -39,18 +39,18 @@ class Running:
     unit: str
 
 
-def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
+def integrals_as_states(problem: OptimalControlProblem) -> OptimalControlProblem:
     """Return the same problem without integrals: each of their rows is a further state, or the sum of two, that is
     bounded at one time. These states are known at the beginning and not measured.
 
     The system stays a single one where it is one and all windows begin at 0. Integrals then continue to the horizon,
     since nothing depends on them after their window. Parameters of a system that also depends on time became states
-    before (`superposed`), and integrals of these states are possible too. With errors of execution, the phases of a
-    system and a delay become one system that changes with time (`in_time`).
+    before (`parameters_as_states`), and integrals of these states are possible too. With errors of execution, the
+    phases of a system and a delay become one system that changes with time (`follow_in_time`).
     """
-    problem = superposed(in_rows(problem))
+    problem = parameters_as_states(combine_states(problem))
     if not problem.integral:
-        return in_time(problem)
+        return follow_in_time(problem)
     running, ends, d = list[Running](), list[Accumulated](), problem.system.states
     for entry, name in zip(problem.integral, problem.called("integral"), strict=True):
         rows, end = _build_running_states(problem, entry, name)
@@ -60,7 +60,7 @@ def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
     if not problem.system.switches and all(state.start == 0.0 for state in running):
         running = [replace(state, stop=problem.horizon) for state in running]
     k = len(running)
-    larger_problem = larger(
+    larger_problem = enlarge_problem(
         problem,
         k,
         system=_extend_system(problem.system, running, problem.horizon),
@@ -70,10 +70,10 @@ def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
         names=_extend_names(problem.names, d, running),
         commanded=_find_commanded_states(problem, running),
     )
-    return in_time(larger_problem)
+    return follow_in_time(larger_problem)
 
 
-def in_rows(problem: OptimalControlProblem) -> OptimalControlProblem:
+def combine_states(problem: OptimalControlProblem) -> OptimalControlProblem:
     """Return the same problem with windows and integrals as its only constraints; every other constraint is expressed
     by these."""
     if all(entry.among for entries in problem.lists.values() for entry in entries):

@@ -21,7 +21,7 @@ MAX_BOX_CORNERS = 64
 _CACHE: WeakKeyDictionary[OptimalControlProblem, OptimalControlProblem] = WeakKeyDictionary()
 
 
-def in_time(problem: OptimalControlProblem) -> OptimalControlProblem:
+def follow_in_time(problem: OptimalControlProblem) -> OptimalControlProblem:
     """Return the same problem with a system that changes with time, where the method needs one.
 
     This is the case for errors of execution with phases of the system or parameters, and for measurable disturbances

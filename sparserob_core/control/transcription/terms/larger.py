@@ -15,7 +15,7 @@ from sparserob_core.control.sets.sets import product
 from sparserob_core.sip.convex_set import Box
 
 
-def larger(problem: OptimalControlProblem, more: int, **replacements: Any) -> OptimalControlProblem:
+def enlarge_problem(problem: OptimalControlProblem, more: int, **replacements: Any) -> OptimalControlProblem:
     """Return the problem with ``more`` further states; ``replacements`` holds its new system, constraints and names."""
     d, zeros, initial_set = problem.system.states, np.zeros(more), problem.initial_set
     measurements, (state, _, final) = problem.measurements or Measurements(np.eye(d)), problem.cost.terms

@@ -14,25 +14,25 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.windows import everywhere
 from sparserob_core.control.sets.sets import Equality, cylinder
-from sparserob_core.control.transcription.terms.in_time import corners_of_box, in_time
-from sparserob_core.control.transcription.terms.larger import larger
+from sparserob_core.control.transcription.terms.in_time import corners_of_box, follow_in_time
+from sparserob_core.control.transcription.terms.larger import enlarge_problem
 from sparserob_core.sip.convex_set import Array
 
 
-def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
+def parameters_as_states(problem: OptimalControlProblem) -> OptimalControlProblem:
     """Return the same problem without parameters of a system that also depends on time.
 
     The states at the middle of the box of parameters stay the first ones. The contribution of each parameter follows,
     per half of its interval; both obey known equations. A bound of the state holds for all parameters where it holds at
     the corners. A curved bound becomes one constraint for each corner. Halves of intervals are rounded outwards. With
-    errors of execution, or measurable disturbances, parameters of any system are treated so (`in_time`).
+    errors of execution, or measurable disturbances, parameters of any system are treated so (`follow_in_time`).
     """
-    problem = in_time(problem)
+    problem = follow_in_time(problem)
     system = problem.system
     depends, rows = system.dependence, at_corners(problem)
     if depends is None or rows is None:  # there are none, or they stay in the index
         return problem
-    return larger(
+    return enlarge_problem(
         problem,
         depends.states - system.states,
         system=system.superposed(depends),
@@ -55,14 +55,14 @@ def at_corners(problem: OptimalControlProblem) -> list[Array] | None:
     """Return one matrix ``(d, size)`` for each corner of the box of parameters. It gives the states of the user from
     the states at the middle and the contributions of the parameters. ``None`` where the state is not an affine function
     of parameters."""
-    depends = in_time(problem).system.dependence
+    depends = follow_in_time(problem).system.dependence
     return None if depends is None else [depends.rows(corner) for corner in corners_of_box(depends)]
 
 
 def corners_of(problem: OptimalControlProblem) -> Corners:
     """Return the corners of a problem as the user stated it; without entries where the state is not an affine function
     of parameters."""
-    system, rows = in_time(problem).system, at_corners(problem)
+    system, rows = follow_in_time(problem).system, at_corners(problem)
     if rows is None or system.dependence is None:
         return Corners()
     box, is_affected = system.box, system.dependence.affected

@@ -55,9 +55,10 @@ def compare(
     and 0.1 % of it. With --watch, or --save, --serve or --connect, the runs are side by side in the viewer of Rerun
     too, an optional extra (pip install rerun-sdk).
 
-    For studies (each RUN is then a directory that sparserob sweep has left) it prints and draws performance profiles,
-    which share of the problems each contender solves within a factor of what the best one needs, and data profiles,
-    which share it solves within a budget; medians and quartiles over seeds.
+    For studies (each RUN is then a directory that sparserob sweep has left) it prints and draws two kinds of
+    profiles. A performance profile is the share of the problems that a contender solves within a factor of what the
+    best one needs. A data profile is the share that it solves within a budget. Both have medians and quartiles over
+    seeds.
     """
     from sparserob_core.experiment.comparison.compare import compare as side_by_side
     from sparserob_core.experiment.comparison.compare import comparison_summary, comparison_table

@@ -18,7 +18,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.repeat import widths
 from sparserob_core.control.problem.terms.windows import MixedConstraint, UntilHorizon
-from sparserob_core.control.problem.tracing import traced
+from sparserob_core.control.problem.tracing import trace_entries
 from sparserob_core.control.sets.sets import Box, Equality, Product, SetFactory
 from sparserob_core.control.term import Term
 from sparserob_core.errors import InputError
@@ -163,7 +163,7 @@ def _write_rows(phase: Phase, name: str) -> Any:
     if isinstance(value, ExpressionMatrix):
         return [[entry.text for entry in row] for row in value.entries]
     if callable(value):
-        return traced(name, value, phase.names, phase.probes)
+        return trace_entries(name, value, phase.names, phase.probes)
     matrix: Array = np.asarray(value, dtype=float)
     return pack(matrix) if matrix.size > MAX_WRITTEN_ENTRIES else matrix.tolist()
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sparserob_core.control.transcription.provable import remarked
-from sparserob_core.control.transcription.rounding import SMALL_GAP, rounded_down
+from sparserob_core.control.transcription.provable import add_assumptions
+from sparserob_core.control.transcription.rounding import SMALL_GAP, reduce_bound
 from sparserob_core.experiment.assemble import ControlExperiment, counting
 from sparserob_core.experiment.directory.artefacts import finite
 from sparserob_core.experiment.directory.certificate import certificate
@@ -40,7 +40,7 @@ def bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) -
     if result.status == "undecided" and not np.isfinite(result.dual.bound):
         result = replace(result, lower_bound=0.0)  # no term of a cost is negative, and nothing else is proven
     proven = with_final_states(model, result, experiment.gap_tolerance)
-    return remarked(model, _derive_bound(experiment, proven, deadline))
+    return add_assumptions(model, _derive_bound(experiment, proven, deadline))
 
 
 def unbounded(result: Result) -> Result:
@@ -73,7 +73,7 @@ def _derive_bound(experiment: ControlExperiment, result: Result, deadline: Deadl
     """
     tolerance = experiment.gap_tolerance
     weights = None if any(counting(experiment.loaded)) else experiment.program.finite.weights
-    rounded = rounded_down(experiment.transcription, result, tolerance, weights)
+    rounded = reduce_bound(experiment.transcription, result, tolerance, weights)
     if result.status not in ("certified", "verified") or tolerance is None or result.stopped:
         return rounded
     feedback = experiment.transcription.feedback

@@ -10,7 +10,7 @@ import numpy as np
 from sparserob_core.control.problem.cost import by_time
 from sparserob_core.control.sets.curved import NormBall
 from sparserob_core.control.sets.sets import ConvexSet
-from sparserob_core.control.transcription.rounding import rounded_down
+from sparserob_core.control.transcription.rounding import reduce_bound
 from sparserob_core.experiment.assemble import ControlExperiment
 from sparserob_core.sip.evidence import Activity
 from sparserob_core.sip.method import Tools
@@ -18,7 +18,7 @@ from sparserob_core.sip.methods.fewest import LeastCount, is_vertex, multiple
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
-from sparserob_core.sip.working.counting import count, share_of, whole
+from sparserob_core.sip.working.counting import count, round_up_count, share_of
 
 # Share of a bound that is taken off, so that a check with another rounding derives no smaller one
 COUNT_ALLOWANCE = 1e-9
@@ -123,7 +123,7 @@ def longest(bound: ConvexSet, channels: Sequence[int]) -> float:
 
 
 def _round_down(program: SemiInfiniteProgram, least: float) -> float:
-    return whole(program, least - COUNT_ALLOWANCE * abs(least)) if np.isfinite(least) else -np.inf
+    return round_up_count(program, least - COUNT_ALLOWANCE * abs(least)) if np.isfinite(least) else -np.inf
 
 
 def _compute_share(program: SemiInfiniteProgram, counted: float) -> float | None:
@@ -143,4 +143,4 @@ def _minimise_count(experiment: ControlExperiment, result: Result, tools: Tools,
     except KeyboardInterrupt as error:
         tools.deadline.interrupt(error)
         return None
-    return None if count_result.status in ENDED else rounded_down(experiment.transcription, count_result, None)
+    return None if count_result.status in ENDED else reduce_bound(experiment.transcription, count_result, None)

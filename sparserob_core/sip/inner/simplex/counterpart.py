@@ -26,7 +26,7 @@ from scipy.sparse import csc_array, csr_array, diags_array, vstack
 from sparserob_core.errors import PluginError, named
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import HIGHS, FiniteProgram, Spread, UncertainRows, entries_of, gathered
-from sparserob_core.sip.inner.duality import Terms, add_pairwise, bound_rounding, tangent_terms, without_norms
+from sparserob_core.sip.inner.duality import Terms, add_pairwise, bound_rounding, replace_norms, tangent_terms
 from sparserob_core.sip.inner.simplex.interruptible import run
 from sparserob_core.sip.inner.simplex.silence import silent
 from sparserob_core.sip.inner.simplex.tangents import Tangents
@@ -728,7 +728,7 @@ def robust_bound(
     noise = noise + np.bincount(noise_column, np.abs(noise_value), program.n)
     weights = program.weights if priced else np.zeros(program.n)
     if priced and program.blocks is not None:
-        tilted = without_norms(Terms(constant, slope, noise, weights, None, size, at), program)
+        tilted = replace_norms(Terms(constant, slope, noise, weights, None, size, at), program)
         slope, noise, weights = tilted.slope, tilted.noise, tilted.weights
     ends = np.stack([program.lower, program.upper, np.clip(0.0, program.lower, program.upper)])
     with np.errstate(invalid="ignore"):

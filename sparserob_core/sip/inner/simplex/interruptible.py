@@ -64,7 +64,7 @@ def run(highs: Any) -> None:
             highs.cbMipInterrupt -= asked
 
 
-def with_integers(
+def solve_with_integers(
     cost: Array,
     couplings: Sequence[LinearConstraint],
     lower: Array,

@@ -16,7 +16,7 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import Directions, FiniteProgram
-from sparserob_core.sip.inner.norms import around
+from sparserob_core.sip.inner.norms import spread_directions
 
 Entries = list[tuple[np.ndarray, np.ndarray, Array]]
 
@@ -72,7 +72,7 @@ class Tangents:
         if blocks is not None:
             weights = self.program.weights[blocks.first]
             self._norms = self.linear.variables(np.zeros(weights.size), np.full(weights.size, np.inf), weights)
-            self._add_directions(around(blocks))
+            self._add_directions(spread_directions(blocks))
 
     def sharpen(self, x: Array, squares: Array) -> None:
         """Touch every norm at ``x (n,)`` and every square at the root ``(c,)`` that the linear program has."""

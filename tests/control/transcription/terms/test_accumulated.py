@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.transcription.terms.accumulated import accumulated
+from sparserob_core.control.transcription.terms.accumulated import integrals_as_states
 
 SPRING = sr.LinearSystem([[0, 1], [-2, -0.5]], [[0], [1]])
 
@@ -20,8 +20,8 @@ def problem(*integrals: sr.IntegralConstraint, **more: Any) -> sr.OptimalControl
 
 def test_one_that_begins_at_0_leaves_a_single_system_and_others_make_pieces() -> None:
     first, later = (sr.IntegralConstraint(G=[[1]], upper=1, start=start, stop=4.0) for start in (0.0, 1.0))
-    assert accumulated(problem(first)).system.switches == ()
-    assert accumulated(problem(first, later)).system.switches == (1.0, 4.0)
+    assert integrals_as_states(problem(first)).system.switches == ()
+    assert integrals_as_states(problem(first, later)).system.switches == (1.0, 4.0)
 
 
 def test_states_that_are_added_up_have_the_names_and_units_of_what_they_add_up() -> None:
@@ -35,7 +35,7 @@ def test_states_that_are_added_up_have_the_names_and_units_of_what_they_add_up()
     )
     fuel = sr.IntegralConstraint(G=[[1]], upper=1, name="fuel")
     both = sr.IntegralConstraint(H=[[1, 0], [0, 1]], lower=[0, None], upper=[None, 1])
-    found = accumulated(problem(fuel, both, names=names)).names
+    found = integrals_as_states(problem(fuel, both, names=names)).names
     assert list(found.states) == ["p", "v", "fuel", "integral[1] 1", "integral[1] 2"]
     assert list(found.state_units) == ["m", "m/s", "kg", "m s", "m"]
 

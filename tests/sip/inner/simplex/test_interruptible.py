@@ -13,7 +13,7 @@ import pytest
 from scipy.optimize import LinearConstraint
 
 from sparserob_core.sip.inner.simplex import interruptible
-from sparserob_core.sip.inner.simplex.interruptible import run, with_integers
+from sparserob_core.sip.inner.simplex.interruptible import run, solve_with_integers
 
 
 def long(seconds: float) -> tuple[np.ndarray, list[LinearConstraint], np.ndarray, np.ndarray, int, float, float]:
@@ -26,10 +26,10 @@ def long(seconds: float) -> tuple[np.ndarray, list[LinearConstraint], np.ndarray
 def test_whole_numbers_cost_least() -> None:
     cost, lower, upper = np.ones(3), np.array([-1.0, 0.0, 0.0]), np.array([3.0, 1.0, 1.0])
     row = np.array([[1.0, 2.0, 3.5]])
-    found = with_integers(cost, [LinearConstraint(row, 4.0, np.inf)], lower, upper, 1, 5.0, 0.0)
+    found = solve_with_integers(cost, [LinearConstraint(row, 4.0, np.inf)], lower, upper, 1, 5.0, 0.0)
     assert found is not None
     np.testing.assert_allclose(found, [-1.0, 1.0, 1.0], atol=1e-9)
-    assert with_integers(cost, [LinearConstraint(row, 40.0, np.inf)], lower, upper, 1, 5.0, 0.0) is None
+    assert solve_with_integers(cost, [LinearConstraint(row, 40.0, np.inf)], lower, upper, 1, 5.0, 0.0) is None
 
 
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="no alarm")
@@ -42,7 +42,7 @@ def test_an_interrupt_ends_the_solver() -> None:
     try:
         signal.setitimer(signal.ITIMER_REAL, 0.1)
         with pytest.raises(KeyboardInterrupt, match="now"):
-            with_integers(*long(60.0))
+            solve_with_integers(*long(60.0))
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
