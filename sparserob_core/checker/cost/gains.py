@@ -134,8 +134,8 @@ class GainsBound:
         projection = identity(lengths.size).tolist()
         try:
             for place, line in zip(free, (X * (D * X).inv() * D).tolist(), strict=True):
-                for other, x in zip(free, line, strict=True):
-                    projection[place][other] = x
+                for column, x in zip(free, line, strict=True):
+                    projection[place][column] = x
         except ZeroDivisionError:
             return None
         return stacked(projection)
