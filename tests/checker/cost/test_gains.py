@@ -221,3 +221,28 @@ def test_honest_runs_are_verified_whatever_depends_on_what(name: str, tmp_path: 
     outcome = sr.run(said, out=tmp_path / "run", quiet=True, figures=False)
     found = check(outcome.directory)
     assert found.status == "verified", [claim.text for claim in found.claims if claim.verdict != "holds"]
+
+
+@pytest.mark.parametrize("breakpoints", [[0, 0.2, 0.4, 0.6, 3.5, 4], [0, 1.5, 1.7, 4], [0, 0.3, 2, 2.1, 2.2, 4]])
+def test_the_lower_bound_of_a_policy_is_verified_where_the_disturbance_has_breakpoints_of_its_own(
+    breakpoints: list[float], tmp_path: object
+) -> None:
+    config = {
+        "problem": {
+            "name": "linear",
+            "system": {"A": [[-0.1]], "B": [[1]], "E": [[1]]},
+            "horizon": 4.0,
+            "initial_state": [2],
+            "control": {"box": 1.0},
+            "disturbance": {"box": [0.2]},
+            "terminal": [{"box": [0.3]}],
+        },
+        "dictionaries": {
+            "control": {"name": "piecewise_constant", "pieces": 4},
+            "disturbance": {"name": "piecewise_constant", "breakpoints": breakpoints},
+        },
+        "policy": {"name": "affine", "cost": "peak"},
+        "observers": [],
+    }
+    sr.run(config, out=f"{tmp_path}/run", quiet=True, figures=False)
+    assert sr.check(f"{tmp_path}/run").status == "verified"
