@@ -19,6 +19,7 @@ from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.cost.duality import ConstraintRow
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.shape import find_range
 from sparserob_core.control.sets.curved import NormBall
 
 ROUNDED = 1e-12  # relative to the terms of a value of the control: a smaller value counts as 0
@@ -131,11 +132,7 @@ def _bound_piece(
 
 def _enclose_ranges(case: Case) -> list[tuple[arb, arb]]:
     """Return the least and the largest value of every channel."""
-    ranges, m, shape = [], case.problem.system.controls, known(case.problem.control)
-    for i in range(m):
-        axis = [ball(i == j) for j in range(m)]
-        ranges.append((-shape.support([-a for a in axis]), shape.support(axis)))
-    return ranges
+    return [find_range(known(case.problem.control), i) for i in range(case.problem.system.controls)]
 
 
 def _enclose_lengths(case: Case) -> list[arb]:

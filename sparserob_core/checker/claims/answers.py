@@ -20,12 +20,13 @@ from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.claims.case import STEP, Case, number, numbers, shaped
 from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow, steps
 from sparserob_core.checker.cost.effort import prove_effort_limit
-from sparserob_core.checker.cost.gains import GainsBound, reach
+from sparserob_core.checker.cost.gains import GainsBound
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, Broken, Unchecked
 from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.reach.closed_loop import NO_GAINS, VerifiedLoop
 from sparserob_core.checker.reach.inner_loop import PlantInputs, StateBound
 from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.shape import find_range
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 PEAK, WORST = "peak", "worst"
@@ -206,7 +207,8 @@ class VerifiedFeedback:
         case, total, largest_effort = self.case, ball(0), ball(0)
         for k, costs in enumerate(case.price.costs if self.charges_bounds else ()):
             for i, price in enumerate(costs):
-                largest_value = reach(case.problem.control, i)
+                low, high = find_range(known(case.problem.control), i)
+                largest_value = high.max(-low).max(ball(0))
                 largest_effort = largest_effort + price * largest_value
                 if case.charge != WORST:
                     remaining_price = price * int(priced) - sum(
@@ -275,15 +277,13 @@ class VerifiedFeedback:
 
 def _collect_inputs(case: Case) -> PlantInputs:
     """Return what drives the plant, and what bounds its states."""
-    control = [_span(case.problem.control, axis) for axis in np.eye(case.problem.system.controls)]
     states, initial = balls(np.asarray(case.problem.initial_state)), case.problem.initial_set
     if initial is not None:
-        states = [x + _span(initial, axis) for x, axis in zip(states, np.eye(len(states)), strict=True)]
-    width = case.problem.system.disturbances
-    disturbance = [ball(0.0)] * width
+        states = [x + deviation for x, deviation in zip(states, _span(initial), strict=True)]
+    disturbance = [ball(0.0)] * case.problem.system.disturbances
     if case.problem.disturbance is not None:
-        disturbance = [_span(case.problem.disturbance, axis) for axis in np.eye(width)]
-    columns = [arb_mat(len(values), 1, values) for values in (states, control, disturbance)]
+        disturbance = _span(case.problem.disturbance)
+    columns = [arb_mat(len(values), 1, values) for values in (states, _span(case.problem.control), disturbance)]
     return PlantInputs(columns[0], columns[1], columns[2], _bound_states(case))
 
 
@@ -309,10 +309,10 @@ def _bound_states(case: Case) -> list[StateBound]:
     return bounds
 
 
-def _span(shape: ConvexSet, axis: Array) -> arb:
-    """Return a ball that contains the values of a set along an axis."""
-    high, low = (known(shape).support(balls(sign * axis)) for sign in (1.0, -1.0))
-    return (-low).union(high)
+def _span(shape: ConvexSet) -> list[arb]:
+    """Return balls that contain the values of every channel over a set."""
+    ranges = [find_range(known(shape), channel) for channel in range(shape.dimension)]
+    return [low.union(high) for low, high in ranges]
 
 
 def commanded(case: Case, name: str) -> ConvexSet | None:

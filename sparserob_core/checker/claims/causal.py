@@ -26,12 +26,13 @@ from flint import arb
 from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.claims.answers import PEAK, WORST
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
+from sparserob_core.checker.claims.multipliers import MAX_MULTIPLIERS
 from sparserob_core.checker.cost.duality import ConstraintRow
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.known import known, middle
+from sparserob_core.checker.sets.shape import find_range
 from sparserob_core.sip.convex_set import Array
 
-MAX_MULTIPLIERS = 100_000  # multipliers that are checked
 WeightedRow: TypeAlias = (
     "tuple[ConstraintRow, list[list[arb]], list[arb]]"  # a row, its weights of the disturbance and the initial state
 )
@@ -256,9 +257,8 @@ def _share_peak_price(case: Case, prices: list[arb], groups: dict[bytes, list[ar
     of the parts is at most the price, since ``max_g |u_g|`` is at least every mean of ``|u_g|``."""
     shares = {key: [ball(0)] * len(prices) for key in groups}
     for i, price in enumerate(prices):
-        axis = [ball(j == i) for j in range(len(prices))]
-        high, low = known(case.problem.control).support(axis), known(case.problem.control).support([-x for x in axis])
-        largest_values = {key: float((high if slope[i] < 0 else low).mid()) for key, slope in groups.items()}
+        low, high = find_range(known(case.problem.control), i)
+        largest_values = {key: float((high if slope[i] < 0 else -low).mid()) for key, slope in groups.items()}
         remaining_price = float(price.lower()) * SHARE
         for key in sorted(groups, key=lambda key: -largest_values[key]):
             share = min(remaining_price, abs(float(groups[key][i].mid()))) if largest_values[key] > 0.0 else 0.0

@@ -519,11 +519,6 @@ def compared(case: Case) -> float:
     return max(added_up(case), 0.0 if case.counts else case.price.terms(case.pieces))
 
 
-def largest_cost(case: Case) -> float:
-    """Return the largest cost that a control may have; earlier versions made the gap relative to it."""
-    return activity.longest_time(case) if case.counts else case.price.largest
-
-
 def _verify_witness(case: Case) -> str:
     """Show that the state to which the witness leads violates the constraint by as much as is written."""
     data = case.certificate.get("witness")

@@ -23,7 +23,7 @@ from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.sip.convex_set import Array
 
-MAX_MULTIPLIERS = 100_000
+MAX_MULTIPLIERS = 100_000  # multipliers that are checked
 
 
 def multiplied(case: Case, priced: bool) -> arb:

@@ -26,6 +26,7 @@ from sparserob_core.checker.problem.held import HeldComponents, summed
 from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.reach.followed import FollowedRows
 from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.shape import find_range
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -271,9 +272,8 @@ class Duality:
         return certified, error_bound
 
     def _bound_coefficients(self, channel: int) -> list[arb]:
-        axis = [ball(float(i == channel)) for i in range(self.problem.system.controls)]
-        shape = known(self.problem.control)
-        reach = shape.support(axis).max(shape.support([-a for a in axis]))
+        low, high = find_range(known(self.problem.control), channel)
+        reach = high.max(-low)
         return [sum((abs(x) for x in row), ball(0.0)) * reach for row in self._pseudoinverse]
 
     @cached_property

@@ -23,7 +23,7 @@ from typing import final
 import numpy as np
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from sparserob_core.checker.arithmetic.balls import ball, balls, largest, rational, spanning
+from sparserob_core.checker.arithmetic.balls import ball, largest, rational, spanning
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import exactly, identity, middles, stacked, zeros
 from sparserob_core.checker.cost.duality import ConstraintRow
@@ -134,8 +134,8 @@ class GainsBound:
         projection = identity(lengths.size).tolist()
         try:
             for place, line in zip(free, (X * (D * X).inv() * D).tolist(), strict=True):
-                for other, x in zip(free, line, strict=True):
-                    projection[place][other] = x
+                for column, x in zip(free, line, strict=True):
+                    projection[place][column] = x
         except ZeroDivisionError:
             return None
         return stacked(projection)
@@ -229,10 +229,3 @@ def _stack_columns(segments: Sequence[tuple[Sequence[Fraction], arb]]) -> arb_ma
     """Return vectors as columns ``(d, s)``."""
     columns = [[rational(v) for v in vector] for vector, _ in segments]
     return stacked(columns).transpose() if columns else zeros(0, 0)
-
-
-def reach(shape: ConvexSet, channel: int) -> arb:
-    """Return the largest absolute value of a channel over a set."""
-    axis = np.eye(shape.dimension)[channel]
-    high, low = (known(shape).support(balls(sign * axis)) for sign in (1.0, -1.0))
-    return high.max(low).max(high * 0)

@@ -19,7 +19,6 @@ from sparserob_core.checker.arithmetic.series import norm, stacked
 from sparserob_core.checker.cost.nominal import NominalMotion, QuadraticTerms, evaluate_quadratic_terms, nominal_states
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.outcome import NO_LIMIT, Broken, Clock, Unchecked
-from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -159,24 +158,6 @@ class Price:
         """Return the sum of the absolute values of all products in the quadratic terms of a control, which rounding is
         relative to."""
         return self._evaluate_quadratic(pieces).terms if self.is_quadratic else 0.0
-
-    @cached_property
-    def largest(self) -> float:
-        """The scale that gaps had in earlier versions: a bound of the cost of absolute values, plus the largest value
-        of the quadratic terms where all channels stay 0, or one at plus or minus its largest absolute value."""
-        m = self.problem.system.controls
-        axes = np.eye(m)
-        ends = [
-            [float(known(self.problem.control).support(balls(s * axis)).mid()) for s in (1.0, -1.0)] for axis in axes
-        ]
-        reach = [max(abs(high), abs(low)) for high, low in ends]
-        durations = np.diff([*self._weight_changes[0], self.problem.horizon])
-        total = float(self.problem.cost.l1) * float(durations @ self._weight_changes[1] @ np.asarray(reach))
-        if not self.is_quadratic:
-            return total
-        vectors = [np.zeros(m)] + [s * r * axis for axis, r in zip(axes, reach, strict=True) for s in (1.0, -1.0)]
-        controls = [[stacked([[u] for u in balls(control)])] * len(self._piece_lengths) for control in vectors]
-        return total + max(float(self._evaluate_quadratic(pieces).value.mid()) for pieces in controls)
 
     @property
     def _quadratic_terms(self) -> tuple[Quadratic | None, ...]:

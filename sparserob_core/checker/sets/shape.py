@@ -216,14 +216,20 @@ class Shape(ABC):
     @cached_property
     def radius(self) -> list[float]:
         """The upper bounds of ``|w_i|`` over the set, one per coordinate, rounded up."""
-        axes = np.eye(self.dimension)
-        return [above(self.support(balls(axis)).max(self.support(balls(-axis)))) for axis in axes]
+        ranges = [find_range(self, channel) for channel in range(self.dimension)]
+        return [above(high.max(-low)) for low, high in ranges]
 
 
 def width(shape: Shape, channel: int) -> arb:
     """Return the width of a set along an axis."""
+    low, high = find_range(shape, channel)
+    return high - low
+
+
+def find_range(shape: Shape, channel: int) -> tuple[arb, arb]:
+    """Return the least and the largest value of a channel over a set."""
     axis = np.eye(shape.dimension)[channel]
-    return shape.support(balls(axis)) + shape.support(balls(-axis))
+    return -shape.support(balls(-axis)), shape.support(balls(axis))
 
 
 def basis_of(shape: Shape) -> tuple[Array, Array] | None:

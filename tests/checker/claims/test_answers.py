@@ -20,10 +20,9 @@ from sparserob_core.checker.claims import claims, constraints, replay
 from sparserob_core.checker.claims import multipliers as bounds
 from sparserob_core.checker.claims.answers import VerifiedFeedback, feedback_of
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.cost.gains import reach
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.known import known
-from sparserob_core.checker.sets.shape import width
+from sparserob_core.checker.sets.shape import find_range, width
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid, Equality, NormBall, Polytope, Product
@@ -453,13 +452,14 @@ def test_a_policy_is_refused_where_the_checker_does_not_know_the_system():
 
 
 def test_how_far_and_how_wide_a_set_is_along_a_channel():
-    for shape, wide, far in (
-        (Box([-1.0, 2.0], [3.0, 5.0]), (4.0, 3.0), (3.0, 5.0)),
-        (Box([-3.0, -5.0], [1.0, -2.0]), (4.0, 3.0), (3.0, 5.0)),
-        (NormBall(p=2.0, radius=2.0, centre=[0.5, -1.0]), (4.0, 4.0), (2.5, 3.0)),
+    for shape, wide, ends in (
+        (Box([-1.0, 2.0], [3.0, 5.0]), (4.0, 3.0), ((-1.0, 3.0), (2.0, 5.0))),
+        (Box([-3.0, -5.0], [1.0, -2.0]), (4.0, 3.0), ((-3.0, 1.0), (-5.0, -2.0))),
+        (NormBall(p=2.0, radius=2.0, centre=[0.5, -1.0]), (4.0, 4.0), ((-1.5, 2.5), (-3.0, 1.0))),
     ):
         assert [float(width(known(shape), c).mid()) for c in (0, 1)] == pytest.approx(wide)
-        assert [float(reach(shape, c).mid()) for c in (0, 1)] == pytest.approx(far)
+        for channel, expected in enumerate(ends):
+            assert [float(end) for end in find_range(known(shape), channel)] == pytest.approx(expected)
 
 
 def test_a_direction_of_a_fixed_state_is_that_state_alone_at_the_end():

@@ -704,19 +704,6 @@ def test_numbers_that_are_far_apart_are_computed_with_more_bits():
         assert claims.precision_of(case) == (claims.MAX_PRECISION if apart is None else claims.PRECISION + apart)
 
 
-def test_the_largest_cost_is_that_of_the_far_end_of_every_channel():
-    case = case_of(control=Box([-1.0], [2.0]), weights=[3.0], cost=sr.Cost(l1=0.5))
-    assert claims.largest_cost(case) == pytest.approx(0.5 * 3.0 * 2.0 * 2.0)
-    case = case_of(control=Box([-2.0], [1.0]), weights=[3.0], cost=sr.Cost(l1=0.5))
-    assert claims.largest_cost(case) == pytest.approx(0.5 * 3.0 * 2.0 * 2.0)
-    bent = case_of(
-        control=Box([-2.0], [1.0]), cost=sr.Cost(state={"Q": [[1.0]]}), disturbance=None,
-        system=LinearSystem(np.zeros((1, 1)), ONE),
-    )  # fmt: skip
-    # held at 2 or at -2, whichever costs more: int_0^2 (1 + 2 t)^2 dt = 62 / 3
-    assert claims.largest_cost(bent) == pytest.approx(4.0 + 62.0 / 3.0)
-
-
 def test_the_price_of_a_peak_is_parted_and_no_more_of_it_is():
     """Random slopes of groups of signals: what they are given together is at most the price, and nearly all of it."""
     rng = np.random.default_rng(2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box, Polytope, Zonotope
+from sparserob_core.experiment.check.check import check
 
 ONE = np.array([[0.0], [1.0]])
 PLANTS = {
@@ -178,3 +180,69 @@ def test_breakpoints_that_differ_by_rounding_are_one() -> None:
         control.breakpoints.tolist(), case.disturbances.changes, problem.disturbance,
     ), case.answers, problem.control)  # fmt: skip
     assert 12 not in {block for members in bound._cluster_breakpoints(9) for block in bound._list_blocks(members)}
+
+
+HONEST = {
+    "breakpoints that differ by rounding": (
+        {"A": [[0, 1], [9, 0]], "B": [[0], [1]], "E": [[0], [1]]}, 3.0, [0.3, 0], 3.0, 0.3, [0.1, 0.3],
+        [0.32, 0.8], (15, 20),
+    ),
+    "two disturbances that are one": (
+        {"A": [[0, 1], [0, 0]], "B": [[0], [1]], "E": [[0, 0], [1, 1]]}, 5.0, [4, 0], 1.0, [0.15, 0.15], [0.5, 0.4],
+        [4.2, 1.6], (10, 10),
+    ),
+    "a state that nothing reaches": (
+        {"A": [[0, 1, 0], [0, 0, 1], [0, 0, -1]], "B": [[0], [1], [0]], "E": [[0], [1], [0]]}, 5.0, [4, 0, 0.1], 1.0,
+        0.3, [0.5, 0.4, 1.0], [4.2, 1.6, 1.0], (10, 40),
+    ),
+    "two carts that are one": (
+        {"A": [[0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0]], "B": [[0], [1], [0], [1]],
+         "E": [[0], [1], [0], [1]]}, 5.0, [4, 0, 4, 0], 1.0, 0.3, [0.5, 0.4, 0.5, 0.4], [4.2, 1.6, 4.2, 1.6], (10, 40),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HONEST)
+def test_honest_runs_are_verified_whatever_depends_on_what(name: str, tmp_path: Path) -> None:
+    system, horizon, start, force, push, end, wall, (pieces, blocks) = HONEST[name]
+    said = {
+        "problem": {
+            "name": "linear", "system": system, "horizon": horizon, "initial_state": start,
+            "control": {"box": force}, "disturbance": {"box": push}, "path": [{"box": wall}],
+            "terminal": [{"box": end}],
+        },
+        "dictionaries": {
+            "control": {"name": "piecewise_constant", "pieces": pieces},
+            "disturbance": {"name": "piecewise_constant", "pieces": blocks},
+        },
+        "policy": {"name": "affine"}, "seed": 0,
+    }  # fmt: skip
+    outcome = sr.run(said, out=tmp_path / "run", quiet=True, figures=False)
+    found = check(outcome.directory)
+    assert found.status == "verified", [claim.text for claim in found.claims if claim.verdict != "holds"]
+
+
+@pytest.mark.parametrize("breakpoints", [[0, 0.2, 0.4, 0.6, 3.5, 4], [0, 1.5, 1.7, 4], [0, 0.3, 2, 2.1, 2.2, 4]])
+def test_the_lower_bound_of_a_policy_is_verified_where_the_disturbance_has_breakpoints_of_its_own(
+    breakpoints: list[float], tmp_path: object
+) -> None:
+    config = {
+        "problem": {
+            "name": "linear",
+            "system": {"A": [[-0.1]], "B": [[1]], "E": [[1]]},
+            "horizon": 4.0,
+            "initial_state": [2],
+            "control": {"box": 1.0},
+            "disturbance": {"box": [0.2]},
+            "terminal": [{"box": [0.3]}],
+        },
+        "dictionaries": {
+            "control": {"name": "piecewise_constant", "pieces": 4},
+            "disturbance": {"name": "piecewise_constant", "breakpoints": breakpoints},
+        },
+        "policy": {"name": "affine", "cost": "peak"},
+        "observers": [],
+    }
+    sr.run(config, out=f"{tmp_path}/run", quiet=True, figures=False)
+    assert sr.check(f"{tmp_path}/run").status == "verified"
