@@ -52,9 +52,9 @@ def test_walls_and_ends_beside_others(config: str, tmp_path: Path) -> None:
     start = time.process_time()
     outcome = sr.run(CONFIGS / f"{config}.yaml", out=tmp_path / "run", quiet=True, figures=False)
     spent = {"ours": time.process_time() - start}
-    assert outcome.control is not None and outcome.status == "certified"
+    assert outcome.control is not None and outcome.problem is not None and outcome.status == "certified"
     shots = {"ours": Shot(outcome.summary["cost"], outcome.control)}
-    makers = {"at nodes": lambda _: at_nodes(config, parts=1)}
+    makers: dict[str, Callable[[dict[str, Any]], Shot]] = {"at nodes": lambda _: at_nodes(config, parts=1)}
     makers |= {
         name: make
         for name, (module, make) in OTHERS.items()
