@@ -153,6 +153,28 @@ def test_values_of_plants_that_grow_are_those_of_states_at_nodes(config: str, tm
     assert set(verdicts(outcome).values()) == {"holds"}
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("config", "parts", "below"),
+    [
+        ("aircraft_pitch", 32, 1e-6),  # it rides its wall, so that the reference bends over it between any times
+        ("aircraft_gust", 10, 5e-6),
+        ("bicycle", 10, 2e-5),
+        ("pendulum_push", 1, 1e-7),
+        ("station_keeping", 2, 1e-7),
+    ],
+)
+def test_values_of_stories_are_those_of_states_and_answers_at_nodes(
+    config: str, parts: int, below: float, tmp_path: Path
+) -> None:
+    """Rate limits, policies of measured states and of outputs, and a plan that repeats."""
+    outcome = sr.run(CONFIGS / f"{config}.yaml", out=tmp_path / "run", quiet=True, figures=False)
+    reference, cost = at_nodes(config, parts).cost, outcome.summary["cost"]
+    assert outcome.status == "certified"
+    assert reference * (1.0 - 1e-7) <= cost <= reference * (1.0 + below), (reference, cost)
+    assert set(verdicts(outcome).values()) == {"holds"}
+
+
 def test_what_an_open_loop_cannot_promise_an_inner_loop_keeps(tmp_path: Path) -> None:
     """At e^24 rows in doubles are off by the size of the set at the end. The value is that of states at nodes."""
     problem = amplified(8.0, "affine", terminal=[{"box": {"lower": [-0.41, -0.01], "upper": [-0.39, 0.01]}}])
