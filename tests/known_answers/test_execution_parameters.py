@@ -15,7 +15,7 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.reach.bounded_inputs import BoundedInputOver
-from sparserob_core.control.reach.varying_execution import SpreadExecutionSupport
+from sparserob_core.control.reach.varying_execution import VaryingExecutionSupport
 from sparserob_core.experiment.assemble import ControlExperiment, assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
@@ -212,7 +212,7 @@ def test_errors_at_one_parameter_and_over_cells_are_those_of_the_plant_there() -
     low, high = np.array([-0.02, 0.0]), np.array([0.06, 0.05])
     (leg,) = functionals.over_cells.legs(low, high)
     support = execution.over(control, rows, leg)
-    assert isinstance(support, SpreadExecutionSupport)
+    assert isinstance(support, VaryingExecutionSupport)
     excess, most = [], []
     for ends in ([0.0, 0.0], [1.0, 0.0], [1.0, -1.0]):
         coefficients, more = support.at(times, np.tile(ends, (4, 2, 1)))
@@ -226,7 +226,7 @@ def test_errors_at_one_parameter_and_over_cells_are_those_of_the_plant_there() -
         excess.clear()
     # at a corner only what polynomials in the time are off by is left, in each second of a row, once for each
     # coefficient on the cell
-    per_second = np.abs(rows).sum(axis=1).max() * support.every.execution.kernel.errors.max()
+    per_second = np.abs(rows).sum(axis=1).max() * support.errors.execution.kernel.errors.max()
     left = float(per_second * times.max()) * leg.space.size
     assert most[0] < 1e-3 and most[2] < left < 1e-10
     seen = execution.extend_directions(np.tile(rows, (4, 1)), np.tile([0.03, 0.01], (8, 1)))

@@ -20,7 +20,6 @@ from sparserob_core.control.enclosures.polynomial import distinct_patterns
 from sparserob_core.control.reach.execution import ConstantExecution, Execution
 from sparserob_core.control.reach.measurable import ACCURACY, AT_ONCE, KEPT, TINY
 from sparserob_core.control.reach.support import (
-    KnownCellSupport,
     Leg,
     Support,
     _list_corners,
@@ -31,6 +30,7 @@ from sparserob_core.control.reach.varying_motion import (
     SpreadMotion,
     VaryingMotion,
 )
+from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Propagator, Response, unique_rows
 from sparserob_core.control.response.varying.expansion import Kernel
 from sparserob_core.control.sets.integrals import (
@@ -111,24 +111,21 @@ class VaryingExecution(Execution):
         error_mask = np.tile(self.error_mask, initial_state.size // self.error_mask.size)
         return replace(self, response=response, error_mask=error_mask, _transitions={})
 
-    def on_functionals(self, control: Array, rows: Array, leg: Leg) -> VaryingExecutionCellSupport:
+    def on_functionals(self, control: Array, rows: Array, leg: Leg) -> VaryingExecutionSupport:
         """`Execution.on_functionals`."""
-        assert isinstance(leg, VaryingMotion)
-        return VaryingExecutionCellSupport(self, control, rows, leg)
+        assert not isinstance(leg, LiftedSystem)
+        return VaryingExecutionSupport(self.bound_states(control, leg.motion), rows, leg)
 
-    def reaching(self, control: Array) -> VaryingExecutionCellSupport:
-        """Return the support of the errors of a ``control (m, K)`` without functionals, for the bounds of the states.
-
-        The bounds hold for all coefficients of the state, whatever the functional. The result is remembered.
-        """
-        key = control.tobytes()
-        if key not in self._cell_supports:
-            support = VaryingExecutionCellSupport(self, control, np.zeros((0, self.motion.states)), self.motion)
-            remember(self._cell_supports, key, support, KEPT)
-        return self._cell_supports[key]
+    def bound_states(self, control: Array, motion: VaryingMotion) -> StateErrors:
+        """Return the errors of a ``control (m, K)`` in all coefficients of the state of a ``motion``; the result is
+        remembered for all functionals."""
+        key = control.tobytes() + id(motion).to_bytes(8)
+        if key not in self._state_errors:
+            remember(self._state_errors, key, StateErrors(self, control, motion), KEPT)
+        return self._state_errors[key]
 
     @cached_property
-    def _cell_supports(self) -> dict[bytes, VaryingExecutionCellSupport]:
+    def _state_errors(self) -> dict[bytes, StateErrors]:
         return {}
 
     @cached_property
@@ -349,14 +346,14 @@ class UncertainExecution(Execution):
         assert joined is None  # refused beside curved sets
         return self.on_functionals(control, rows, leg)
 
-    def on_functionals(self, control: Array, rows: Array, leg: Leg) -> SpreadExecutionSupport:
+    def on_functionals(self, control: Array, rows: Array, leg: Leg) -> VaryingExecutionSupport:
         """`Execution.on_functionals`."""
         assert isinstance(leg, SpreadMotion)
         key = id(leg).to_bytes(8)  # of a leg that is kept beside
         if key not in self._cell_executions:
             execution = self.known.following(leg.motion.propagator, leg.motion.initial_state)
             remember(self._cell_executions, key, (leg, execution), CELLS_KEPT)
-        return SpreadExecutionSupport(self._cell_executions[key][1].reaching(control), rows, leg)
+        return self._cell_executions[key][1].on_functionals(control, rows, leg)
 
     def _each(
         self, directions: Array, found: Array, of: Callable[[VaryingExecution, np.ndarray, Array], Array]
@@ -405,74 +402,13 @@ def execution_of(response: Response, breakpoints: Array, shares: Array, error_ma
 
 @final
 @dataclass(frozen=True, eq=False)
-class VaryingExecutionCellSupport(KnownCellSupport):
-    """`ExecutionCellSupport` of a system that changes with time; ``motion`` is the motion of that system."""
+class StateErrors:
+    """The effect of errors of execution of a ``control (m, K)`` on the states of a ``motion``, bounded state by
+    state."""
 
     execution: VaryingExecution
     control: Array
-    rows: Array
     motion: VaryingMotion
-
-    @shaped
-    def at(
-        self, times: Float[Array, " k"], ends: Float[Array, "k r 0"]
-    ) -> tuple[Float[Array, "k r 1"], Float[Array, "k r"]]:
-        """Return support values ``(k, r, 1)`` and their error bounds ``(k, r)``; ``ends (k, r, 0)`` is empty."""
-        return self.between(self.execution.enclosed(self.control, *self.repeated(times)))
-
-    @shaped
-    def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
-        """Return bounds ``(k, r)`` of the height of the support function above its chord on ``[start, start + width]``.
-
-        Each interval is inside one piece. With ``g(t, s) = c'Phi(t, s) B(s)`` the second derivative of the integral of
-        ``|g|`` up to ``t`` is at least ``-|c'B'| - |c'A B| - int |g_tt| ds``, and ``g_tt = c'(A' + A^2) Phi B``: where
-        ``g`` changes its sign the slope jumps upwards only. All terms are bounded at the start, and their change within
-        the cell is added.
-        """
-        motion, d, columns = self.motion, self.motion.states, self.execution.columns
-        pieces = np.minimum(motion.place(start), motion.origin.size - 1)
-        (law, slope), width = motion.law(start, pieces), widths[:, None]
-        used_columns = np.append(np.arange(d), d + columns)
-        law, slope = law[:, :, used_columns], slope[:, :, used_columns]
-        law_bounds, second, third = (
-            bounds[pieces][:, :, used_columns] for bounds in (motion.law_bounds, motion.second, motion.third)
-        )
-        start_sizes, input_sizes = self._bound_effects(start), self.sizing[pieces]
-        state_curvature = np.abs(self.rows @ (slope[:, :, :d] + law[:, :, :d] @ law[:, :, :d]))
-        input_curvature = np.abs(self.rows @ slope[:, :, d:]) + np.abs(self.rows @ law[:, :, :d] @ law[:, :, d:])
-        input_effects = width * np.einsum("kim,km->ki", law_bounds[:, :, d:], input_sizes)
-        state_bounds = motion.grown(pieces, widths, start_sizes + input_effects)
-        change = np.einsum("kij,kj->ki", third[:, :, :d], state_bounds) + np.einsum(
-            "kim,km->ki", third[:, :, d:], input_sizes
-        )
-        change = width * change + np.einsum("kij,kj->ki", second[:, :, :d], input_effects)
-        magnitudes = np.einsum("kij,kj->ki", second[:, :, :d], start_sizes) + np.einsum(
-            "kim,km->ki", second[:, :, d:], input_sizes
-        )
-        change = change + rounding(2 * motion.terms) * magnitudes
-        row_curvature = np.einsum("krj,kj->kr", state_curvature, start_sizes) + np.einsum(
-            "krm,km->kr", input_curvature, input_sizes
-        )
-        return np.asarray(width**2 / 8 * (row_curvature + change @ np.abs(self.rows).T) * OUTWARD)
-
-    @cached_property
-    def neglected(self) -> Array:
-        """Bounds ``(r, K)`` of the error of the functionals on every piece, from the error of the transitions."""
-        return product(np.abs(self.rows), self.state_errors.T)
-
-    @cached_property
-    def state_errors(self) -> Array:
-        """Bounds ``(K, d)`` of the error of the states on every piece, from the error of the transitions."""
-        forcing = self.motion.flow.sizes[..., self.execution.columns] * self.sizing[:, None]
-        return self.motion.bound_state_errors(self.at_marks[:-1], forcing)
-
-    @cached_property
-    def effect_bounds(self) -> Array:
-        """Bounds ``(K, d)`` of the effect of the errors of execution on every state on every piece."""
-        motion, lengths = self.motion, self.motion.grid.lengths
-        columns = motion.states + self.execution.columns
-        rates = np.einsum("kim,km->ki", motion.law_bounds[:, :, columns], self.sizing)
-        return motion.grown(motion.every, lengths, self.at_marks[:-1] + lengths[:, None] * rates)
 
     @cached_property
     def sizing(self) -> Array:
@@ -482,53 +418,76 @@ class VaryingExecutionCellSupport(KnownCellSupport):
 
     @cached_property
     def at_marks(self) -> Array:
-        """Bounds ``(K + 1, d)`` of the effect of the errors of execution on every state at the marks."""
-        return self._bound_effects(self.motion.grid.breakpoints)
-
-    def _bound_effects(self, times: Array) -> Array:
-        """Return bounds ``(k, d)`` of the effect of the errors of execution on every state.
+        """Bounds ``(K + 1, d)`` of the effect on every state at the marks.
 
         For a set of inputs through several columns together the bounds are those of the box around it, whose integrals
         are of absolute values.
         """
-        around, d = self.execution.around, self.motion.states
+        around, marks, d = self.execution.around, self.motion.grid.breakpoints, self.motion.states
         control = np.repeat(self.control, around.shares.size // self.execution.shares.size, axis=0)
-        upper_bounds = around.enclosed(control, *self._each(times, np.eye(d)))[:, 1]
-        return np.asarray(np.maximum(upper_bounds, 0.0).reshape(-1, d) * OUTWARD)
+        bounds = around.enclosed(control, np.repeat(marks, d), np.tile(np.eye(d), (marks.size, 1)))
+        return np.asarray(np.maximum(bounds[:, 1], 0.0).reshape(-1, d) * OUTWARD)
 
-    @staticmethod
-    def _each(times: Array, rows: Array) -> tuple[Array, Array]:
-        """Return all pairs of a time and a row: the times ``(k r,)`` and the rows ``(k r, d)``."""
-        return np.repeat(times, len(rows)), np.tile(rows, (times.size, 1))
+    @cached_property
+    def rounded(self) -> Array:
+        """Bounds ``(K, d)`` of the error of the states on every piece, from the error of the transitions."""
+        forcing = self.motion.flow.sizes[..., self.execution.columns] * self.sizing[:, None]
+        return self.motion.bound_state_errors(self.at_marks[:-1], forcing)
+
+    @cached_property
+    def bounds(self) -> Array:
+        """Bounds ``(K, d)`` of the effect on every state on every piece."""
+        motion, lengths = self.motion, self.motion.grid.lengths
+        rates = np.einsum("kim,km->ki", motion.law_bounds[:, :, self.columns], self.sizing)
+        return motion.grown(motion.every, lengths, self.at_marks[:-1] + lengths[:, None] * rates)
+
+    @cached_property
+    def curvatures(self) -> Array:
+        """Bounds ``(K, d)`` of the second derivative in time of the effect on every state, on every piece."""
+        second, d = self.motion.second, self.motion.states
+        of_states = np.einsum("kij,kj->ki", second[:, :, :d], self.bounds)
+        return np.asarray((of_states + np.einsum("kim,km->ki", second[:, :, self.columns], self.sizing)) * OUTWARD)
+
+    @cached_property
+    def inputs(self) -> Array:
+        """Bounds ``(K, m + mw)`` of the errors through every column of ``[B E]`` on every piece."""
+        inputs = np.zeros((len(self.sizing), self.motion.law_bounds.shape[2] - self.motion.states))
+        inputs[:, self.execution.columns] = self.sizing
+        return inputs
+
+    @property
+    def columns(self) -> np.ndarray:
+        """The columns of ``[A B E]`` through which errors enter."""
+        return self.motion.states + self.execution.columns
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class SpreadExecutionSupport:
-    """The support of errors of execution on functionals ``rows (r, d)`` over a cell of parameters, in the form of
-    `Support`.
+class VaryingExecutionSupport:
+    """The support of errors of execution on functionals ``rows (r, d)`` of a system that changes with time, over a cell
+    of parameters where it has any, in the form of `Support`.
 
-    ``every`` is the support of the errors on all coefficients of the state. A polynomial ``f`` of one parameter is
-    nowhere further from its chord than half the largest ``|f''|`` on ``[-1, 1]``, and the absolute value of the chord
-    is not above the chord of the absolute values. So, in one parameter after another, the integrals of ``|f|`` are at
-    most the linear interpolation of those at the corners, plus half of the integrals of ``|f''|``.
+    ``errors`` are those in all coefficients of the state. A polynomial ``f`` of one parameter is nowhere further from
+    its chord than half the largest ``|f''|`` on ``[-1, 1]``, and the absolute value of the chord is not above the chord
+    of the absolute values. So, in one parameter after another, the integrals of ``|f|`` are at most the linear
+    interpolation of those at the corners, plus half of the integrals of ``|f''|``.
     """
 
-    every: VaryingExecutionCellSupport
+    errors: StateErrors
     rows: Array
-    motion: SpreadMotion
+    cell: VaryingMotion | SpreadMotion
 
     @shaped
     def steepness(self, times: Float[Array, " k"]) -> Float[Array, "k r nu"]:
         """`Support.steepness`."""
-        return np.asarray(self._bound_effects(times) @ self.motion.space.exponents)
+        return np.asarray(self._bound_effects(times) @ self.cell.space.exponents)
 
     @shaped
     def at(
         self, times: Float[Array, " k"], ends: Float[Array, "k r nu"]
     ) -> tuple[Float[Array, "k r M"], Float[Array, "k r"]]:
         """`Support.at`."""
-        space, sizes, support = self.motion.space, self._bound_effects(times), self.every
+        space, sizes, errors = self.cell.space, self._bound_effects(times), self.errors
         coefficients, excess = np.zeros((*ends.shape[:2], space.size)), np.zeros(ends.shape[:2])
         patterns, pattern_indices = distinct_patterns(ends)
         for position, pattern in enumerate(patterns):
@@ -538,9 +497,7 @@ class SpreadExecutionSupport:
             directions = (powers[:, :, None] * self.rows[row_indices][:, None, None, :]).reshape(
                 len(row_indices) * len(corners), -1
             )
-            bounds = support.execution.enclosed(
-                support.control, np.repeat(times[time_indices], len(corners)), directions
-            )
+            bounds = errors.execution.enclosed(errors.control, np.repeat(times[time_indices], len(corners)), directions)
             bounds = bounds.reshape(len(row_indices), len(corners), 2)
             error_bounds = (bounds[..., 1] - bounds[..., 0]).max(axis=1) / 2
             curvature = sizes[time_indices, row_indices] @ (
@@ -552,43 +509,52 @@ class SpreadExecutionSupport:
 
     @shaped
     def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
-        """Return `VaryingExecutionCellSupport.deviation`, from bounds for whole pieces, summed over the coefficients on
-        the cell."""
-        row_curvature = self._curvature_bounds[self._locate_pieces(start)] @ self.motion.sizes(np.abs(self.rows)).T
-        return np.asarray((widths**2 / 8)[:, None] * row_curvature * OUTWARD)
+        """Return bounds ``(k, r)`` of the height of the support function above its chord on ``[start, start + width]``.
+
+        Each interval is inside one piece. With ``g(t, s) = c'Phi(t, s) B(s)`` the second derivative of the integral of
+        ``|g|`` up to ``t`` is at least ``-|c'B'| - |c'A B| - int |g_tt| ds``, and ``g_tt = c'(A' + A^2) Phi B``: where
+        ``g`` changes its sign the slope jumps upwards only. All matrices are those at the start, and their change
+        within the cell is added. The bounds are summed over the coefficients.
+        """
+        motion, d, columns, rows = self.cell.motion, self.cell.motion.states, self.errors.columns, self._every
+        pieces = np.minimum(motion.place(start), motion.origin.size - 1)
+        (law, slope), third = motion.law(start, pieces), motion.third[pieces]
+        A, inputs = law[:, :, :d], law[:, :, columns]
+        states, sizing, whole = (
+            bounds[pieces] for bounds in (self.errors.bounds, self.errors.sizing, self.errors.curvatures)
+        )
+        change = np.einsum("kij,kj->ki", third[:, :, :d], states) + np.einsum(
+            "kim,km->ki", third[:, :, columns], sizing
+        )
+        change = widths[:, None] * change + rounding(2 * motion.terms) * whole
+        of_inputs = np.abs(rows @ slope[:, :, columns]) + np.abs(rows @ A @ inputs)
+        curvatures = np.einsum("krj,kj->kr", np.abs(rows @ (slope[:, :, :d] + A @ A)), states)
+        curvatures += np.einsum("krm,km->kr", of_inputs, sizing) + change @ np.abs(rows).T
+        least = np.minimum(curvatures, whole @ np.abs(rows).T).reshape(start.size, len(self.rows), -1).sum(axis=2)
+        return np.asarray((widths**2 / 8)[:, None] * least * OUTWARD)
 
     @cached_property
     def neglected(self) -> Array:
         """Bounds ``(r, K)`` of the error of the functionals on every piece, from the error of the transitions and from
         the terms beyond the degree."""
-        support, motion, rows = self.every, self.motion, np.abs(self.rows)
-        inputs = np.zeros((len(support.sizing), support.motion.law_bounds.shape[2] - support.motion.states))
-        inputs[:, support.execution.columns] = support.sizing
-        truncation = motion.truncation.bound_error(support.at_marks[:-1] + support.state_errors, inputs)
-        return np.asarray((motion.sizes(rows) @ support.state_errors.T + rows @ truncation.T) * OUTWARD)
+        errors, rows = self.errors, np.abs(self.rows)
+        rounded = product(np.abs(self._every), errors.rounded.T).reshape(len(rows), -1, len(errors.sizing)).sum(axis=1)
+        truncation = self.cell.bound_truncation(errors.at_marks[:-1] + errors.rounded, errors.inputs)
+        return np.asarray((rounded + product(rows, truncation.T)) * OUTWARD)
 
-    @cached_property
+    @property
     def effect_bounds(self) -> Array:
         """Bounds ``(K, d)`` of `Support.effect_bounds`."""
-        return self.motion.folded(self.every.effect_bounds)
-
-    @cached_property
-    def _curvature_bounds(self) -> Array:
-        """Bounds ``(K, states)`` of the second derivative in time of the effect of the errors on every coefficient, on
-        every piece."""
-        support, d = self.every, self.every.motion.states
-        second = support.motion.second
-        input_matrix = second[:, :, d + support.execution.columns]
-        curvatures = np.einsum("kij,kj->ki", second[:, :, :d], support.effect_bounds) + np.einsum(
-            "kim,km->ki", input_matrix, support.sizing
-        )
-        return np.asarray(curvatures * OUTWARD)
+        return self.cell.folded(self.errors.bounds)
 
     def _bound_effects(self, times: Array) -> Array:
         """Return bounds ``(k, r, M)`` of the effect of the errors of execution along every coefficient on the cell."""
-        bounds = self.every.effect_bounds[self._locate_pieces(times)].reshape(times.size, self.motion.space.size, -1)
-        sizes = np.einsum("rd,kad->kra", np.abs(self.rows), bounds)
-        return np.asarray(sizes * OUTWARD)
+        motion = self.cell.motion
+        pieces = np.minimum(motion.place(times), motion.origin.size - 1)
+        bounds = self.errors.bounds[pieces].reshape(times.size, self.cell.space.size, -1)
+        return np.asarray(np.einsum("rd,kad->kra", np.abs(self.rows), bounds) * OUTWARD)
 
-    def _locate_pieces(self, times: Array) -> np.ndarray:
-        return np.asarray(np.minimum(self.every.motion.place(times), self.every.motion.origin.size - 1))
+    @cached_property
+    def _every(self) -> Array:
+        """The functionals as rows ``(r M, states)`` of every coefficient on the cell, on all coefficients."""
+        return self.cell.along_cell(self.rows)

@@ -14,7 +14,7 @@ import sparserob_core.control.response.varying.expansion as expansion
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.problem.system import System, VaryingSystem
 from sparserob_core.control.reach.execution import Execution
-from sparserob_core.control.reach.varying_execution import VaryingExecution, VaryingExecutionCellSupport
+from sparserob_core.control.reach.varying_execution import VaryingExecution
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
 from sparserob_core.control.sets.integrals import enclose_absolute_integrals
 from sparserob_core.control.transcription.transcribe import Transcription, prepare
@@ -155,7 +155,7 @@ def test_bounds_hold_what_coarse_transitions_are_off_by(name: str, monkeypatch: 
     else:
         monkeypatch.setattr(expansion, name, 5)
     coarse = mathieu()
-    support = VaryingExecutionCellSupport(coarse, CONTROL, H, coarse.motion)
+    support = coarse.on_functionals(CONTROL, H, coarse.motion)
     middle, excess = support.at(times, np.zeros((31, 2, 0)))
     off = np.abs(middle[..., 0] - truths)
     assert off.max() > 1e-8, "nothing was left out"
@@ -178,7 +178,7 @@ def test_what_every_step_is_off_by_is_carried_on(monkeypatch: pytest.MonkeyPatch
     zero: list[list[str | float]] = [["0*t", 0], [0, 0]]
     found, c = executed(VaryingSystem.of(zero, [[1, 0], [0, 1]], HORIZON)), np.array([[1.0, 0.0]])
     assert isinstance(found, VaryingExecution)
-    support = VaryingExecutionCellSupport(found, CONTROL, c, found.motion)
+    support = found.on_functionals(CONTROL, c, found.motion)
     true = 0.1 * 0.5 * np.abs(CONTROL[0]).sum()
     wrong = float(found.added(CONTROL, np.array([HORIZON]), c)[0]) - true
     assert 1e-8 < wrong <= support.neglected[0, -1] <= 100 * wrong
@@ -190,7 +190,7 @@ def test_it_is_nowhere_above_its_chord_by_more_than_is_said_and_hardly_less(plan
     found = executed(VaryingSystem.of(*plant, HORIZON))
     assert isinstance(found, VaryingExecution)
     motion, H = found.motion, np.array([[1.0, -0.4], [0.3, 1.0], [-1.0, -0.2]])
-    support, share, ratios = VaryingExecutionCellSupport(found, CONTROL, H, motion), np.linspace(0.0, 1.0, 25), []
+    support, share, ratios = found.on_functionals(CONTROL, H, motion), np.linspace(0.0, 1.0, 25), []
     marks = motion.grid.breakpoints
     starts = np.concatenate([marks[:-1], marks[:-1] + 0.3 * np.diff(marks)])
     widths = np.concatenate([np.diff(marks), 0.01 * np.diff(marks)])
@@ -215,13 +215,13 @@ def test_what_bends_within_a_cell_is_counted(start: float) -> None:
     width, share = 0.3, np.linspace(0.0, 1.0, 25)
     path = found.added(control, start + width * share, np.tile(c, (25, 1)))
     above = (path - (1 - share) * path[0] - share * path[-1]).max()
-    said = VaryingExecutionCellSupport(found, control, c, found.motion).deviation(np.array([start]), np.array([width]))
+    said = found.on_functionals(control, c, found.motion).deviation(np.array([start]), np.array([width]))
     assert above <= said[0, 0]
 
 
 def test_no_error_brings_a_state_further_than_is_said() -> None:
     found, full = mathieu(), np.ones_like(CONTROL)
-    support = VaryingExecutionCellSupport(found, full, np.eye(2), found.motion)
+    support = found.on_functionals(full, np.eye(2), found.motion)
     marks = found.motion.grid.breakpoints
     for share in (0.3, 1.0):
         times = marks[:-1] + share * np.diff(marks)

@@ -170,7 +170,10 @@ def test_what_a_set_makes_of_states_is_bounded_by_the_box_around_it(bound: sr.Co
     )
     assert isinstance(found, VaryingMeasurable) and isinstance(boxed, VaryingMeasurable)
     assert isinstance(found.errors, VaryingExecution)
-    most, marks = found.errors.reaching(found.command).at_marks, found.errors.motion.grid.breakpoints
+    most, marks = (
+        found.errors.bound_states(found.command, found.errors.motion).at_marks,
+        found.errors.motion.grid.breakpoints,
+    )
     both = values(found, marks, np.vstack([np.eye(2), -np.eye(2)]))
     assert (most >= np.maximum(both[:, :2], both[:, 2:])).all()
     np.testing.assert_allclose(most, values(boxed, marks, np.eye(2)), rtol=1e-9)
