@@ -226,7 +226,9 @@ class VerifiedFeedback:
         """The set of the decided part of the control on every piece, with its answers: the set of the control, or
         beside an inner loop a box that is wider by what that loop may add."""
         case, loop = self.case, self.loop_at_rest
-        return case.inner.widen(case.problem.control, lambda: _collect_inputs(case, loop.bound_missing(case.inner.gains)))
+        return case.inner.widen(
+            case.problem.control, lambda: _collect_inputs(case, loop.bound_missing(case.inner.gains))
+        )
 
     def on_decided(self, row: ConstraintRow, named: NamedDeviations) -> ConstraintRow:
         """Return a row of the control under named deviations as one of its decided part, which is the same without an

@@ -294,8 +294,8 @@ def _read_inner_gains(case: Case) -> Array:
     if case.policy is None or case.policy.inner_gain is None:
         return np.zeros((0, 0, 0))
     problem, system = case.problem, case.problem.system
-    if system.delay > 0.0 or problem.repeat:
-        raise Unchecked("the checker knows an inner loop of controls that act at once, for one period")
+    if system.delay > 0.0 or (problem.repeat and problem.control_step is not None):
+        raise Unchecked("the checker knows an inner loop of controls that act at once, without steps between periods")
     if system.parameter_count or system.varies:
         raise Unchecked("the checker knows an inner loop of known systems that do not change with time")
     return shaped(case.certificate, "prestabilise", (case.control.pieces, system.controls, system.states))

@@ -182,7 +182,9 @@ class VerifiedInnerLoop:
         plant that ``collect`` gives. It is a box."""
         inputs = collect()
         # deviations are counted from middles, which rounding may move out of thin sets
-        sizes = ROUNDED * (np.array([above(abs(u)) for u in inputs.control.entries()]) + self.reach(inputs) + inputs.missing)
+        sizes = ROUNDED * (
+            np.array([above(abs(u)) for u in inputs.control.entries()]) + self.reach(inputs) + inputs.missing
+        )
         return Box(-sizes, sizes)
 
     def reach(self, inputs: PlantInputs) -> Array:
@@ -302,7 +304,7 @@ def _narrow(state: arb_mat, rows: list[list[arb]], values: list[arb]) -> arb_mat
 
 
 def lost_digits(
-    plants: Sequence[Sequence[Array]], lengths: Array, gains: Array, corrections: Sequence[Array] = ()
+    plants: Sequence[Sequence[Array]], lengths: Array, gains: Array, corrections: Sequence[Array] | Array = ()
 ) -> float:
     """Return the exponent of what balls and multipliers lose beside gains ``(K, m, d)`` on pieces of ``lengths (K,)``;
     0 without gains. ``plants`` are the matrices ``(A, B)`` of every mode, and ``corrections`` the products

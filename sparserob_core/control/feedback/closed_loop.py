@@ -98,8 +98,8 @@ class ClosedLoop:
         return np.asarray(decided + inner.gains @ self.path(x)[0][self.firsts])
 
     def decided(self, x: Array) -> Array:
-        """Return the part of `controls` without the feedback ``K_k x(tau_k)`` of the inner loop, ``(K, m, 1 + Q)``: what
-        is decided, and the `missing` part of this feedback."""
+        """Return the part of `controls` without the feedback ``K_k x(tau_k)`` of the inner loop, ``(K, m, 1 + Q)``.
+        It is what is decided, with the `missing` part of this feedback."""
         nominal = x[: self.nominal_size].reshape(-1, self.functionals.dictionary.pieces)
         effects = self.answers.effects(x[self.nominal_size : self.nominal_size + self.answers.variables])
         effects = effects + self.missing if self.inner.acts else effects
@@ -116,7 +116,8 @@ class ClosedLoop:
         """Upper bounds ``(m,)`` of the `missing` part of the control under any deviation; 0 without an inner loop."""
         if not self.inner.acts:
             return np.zeros(self.answers.shape[1])
-        return np.maximum(self.spread.support(self.missing), self.spread.support(-self.missing)).max(axis=0)
+        bounds = np.maximum(self.spread.support(self.missing), self.spread.support(-self.missing))
+        return np.asarray(bounds.max(axis=0))
 
     @property
     def inner(self) -> InnerLoop:

@@ -69,9 +69,7 @@ class Observer:
     known: np.ndarray
 
     @staticmethod
-    def of(
-        measured: Measurements, input_effects: Array, flows: Array, radii: Array, breakpoints: Array
-    ) -> Observer:
+    def of(measured: Measurements, input_effects: Array, flows: Array, radii: Array, breakpoints: Array) -> Observer:
         """Return the one-step predictor of Kalman (1960) for deviations of given sizes, a stable observer.
 
         Where the outputs determine the whole state and there is no noise, it predicts from the last measurement alone.
@@ -117,7 +115,7 @@ class Observer:
         noise."""
         return np.asarray(self.C @ states + (self.middle[:, None] if noise is None else noise))
 
-    def estimate(self, k: int, predicted: Array, innovations: Sequence[Array]) -> Array:
+    def estimate(self, k: int, predicted: Array, innovations: Sequence[Array] | Array) -> Array:
         """Return the states ``(d, n)`` at breakpoint ``k`` as the control estimates them that begins there.
 
         Parameters
@@ -171,9 +169,7 @@ class Observer:
         return replace(self, C=C, L=L, flows=flows, middle=self.middle * outputs)
 
 
-def innovations_of(
-    entering: Array, initial_count: int, observer: Observer | None, anew: bool
-) -> tuple[Array, Array]:
+def innovations_of(entering: Array, initial_count: int, observer: Observer | None, anew: bool) -> tuple[Array, Array]:
     """Return the matrices ``(K, p, Q)`` from all deviations to the innovations, and those ``(K, d, Q)`` to the errors
     of the states that the control knows: 0 where states are measured.
 

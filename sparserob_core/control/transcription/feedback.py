@@ -405,7 +405,7 @@ def _refuse_inner_loop(problem: OptimalControlProblem) -> None:
         "a plant that does not change with time": problem.system.varies,
         "a control without delay": problem.system.delay > 0.0,
         "a cost without quadratic terms and groups": not problem.cost.is_linear or bool(problem.cost.blocks),
-        "a plan that does not repeat": bool(problem.repeat),
+        "no control_step where a plan repeats": bool(problem.repeat) and problem.control_step is not None,
     }
     for wanted, hindered in reasons.items():
         if hindered:
