@@ -107,8 +107,8 @@ class Observer:
                 + (L[j] * noise**2) @ L[j].T
                 + input_factors[j + 1] @ input_factors[j + 1].T
             )
-        known = np.tril(measured.known(breakpoints), -1).sum(axis=1)
-        return Observer(C, L, flows, middle, measured.noise is not None, known)
+        known_count = np.tril(measured.known(breakpoints), -1).sum(axis=1)
+        return Observer(C, L, flows, middle, measured.noise is not None, known_count)
 
     def outputs(self, states: Array, noise: Array | None = None) -> Array:
         """Return the outputs ``(p, n)`` of ``states (d, n)``, with the given ``noise`` or else the middle of the
