@@ -225,9 +225,9 @@ class VerifiedFeedback:
     def range(self) -> ConvexSet:
         """The set of the decided part of the control on every piece, with its answers: the set of the control, or
         beside an inner loop a box that is wider by what that loop may add."""
-        case, loop = self.case, self.loop_at_rest
+        case = self.case
         return case.inner.widen(
-            case.problem.control, lambda: _collect_inputs(case, loop.bound_missing(case.inner.gains))
+            case.problem.control, lambda: _collect_inputs(case, self.loop_at_rest.bound_missing(case.inner.gains))
         )
 
     def on_decided(self, row: ConstraintRow, named: NamedDeviations) -> ConstraintRow:
