@@ -37,6 +37,12 @@ END = {"disturbance": None, "terminal": [{"equals": [0.2, 0.0]}]}
 SWITCHED = [{**PUSHED["problem"]["system"], "until": 1.0}, {"A": [[0, 1], [4, 0]], "B": [[0], [2]], "E": [[0], [1]]}]
 BOTH = {"A": [[0, 1], [9, 0]], "B": [[0, 0], [1, 0.5]], "E": [[0], [1]]}
 MIXED = {"mixed": {"H": [[1.0, 0.0], [-1, 0]], "G": [[0.05], [0.0]], "h": [0.5, 0.5]}}
+SENSOR = {"C": [[1, 0]], "noise": {"box": 0.005}}
+OUTPUTS = {"measurements": {**SENSOR, "latency": 0.1}, "disturbance": {"box": 0.1}}
+OUTPUTS |= {"initial_state": {"centre": [0.1, 0.0], "box": [0.02, 0.02]}}
+LATE = {**OUTPUTS, "measurements": {**SENSOR, "latency": 0.3}, "path": [{"box": [0.9, None]}]}
+LATE |= {"terminal": [{"box": {"lower": [-0.9, None], "upper": [0.0, None]}}]}
+AGAIN = {"repeat": True, "initial_state": {"centre": [0.05, 0.0], "box": [0.15, 0.4]}, "disturbance": {"box": 0.1}}
 CASES: dict[str, dict[str, Any]] = {
     "peak": {},
     "nominal": {"policy": {"cost": "nominal"}},
@@ -52,6 +58,15 @@ CASES: dict[str, dict[str, Any]] = {
     "moving": {"problem": {"path": [{"box": [0.5, None], "relative_to": [[0, 0.1, 0], [2.0, -0.1, 0]]}]}},
     "switched": {"problem": {"system": {"pieces": [SWITCHED[0], {**SWITCHED[1], "until": 2.0}]}}},
     "seven pieces": {"dictionaries": {"disturbance": {"name": "piecewise_constant", "pieces": 7}}},
+    "outputs": {"problem": OUTPUTS},
+    "outputs that come late": {"problem": LATE, "policy": {"cost": "nominal"}},
+    "outputs without noise": {"problem": {"measurements": {"C": [[1, 0]], "latency": 0.3}}},
+    "outputs and the worst effort": {"problem": OUTPUTS, "policy": {"cost": "worst"}},
+    "outputs, steps and mixed": {
+        "problem": {**OUTPUTS, "path": [MIXED], "control_step": {"box": 3.0}, "initial_control": [0.0]}
+    },
+    "repeat": {"problem": AGAIN},
+    "repeat and the worst effort": {"problem": AGAIN, "policy": {"cost": "worst"}},
     "gain": {"policy": {"prestabilise": [[-12.0, -4.0]]}},
     "gain that does not stabilise": {"policy": {"prestabilise": [[2.0, 1.0]]}},
 }
@@ -202,10 +217,9 @@ def test_gains_that_are_none_are_one_error_that_names_the_key(wanted: object, me
 
 REFUSED: dict[str, dict[str, Any]] = {
     "delay": {"problem": {"system": {**PUSHED["problem"]["system"], "delay": 0.1}}},
-    "outputs": {"problem": {"measurements": {"C": [[1, 0]], "noise": {"box": 0.01}}}},
     "quadratic": {"problem": {"cost": {"control": {"R": [[1.0]]}}}},
     "in time": {"problem": {"system": {"A": [[0, 1], ["9 + t", 0]], "B": [[0], [1]], "E": [[0], [1]]}}},
-    "repeat": {"problem": {"repeat": True, "initial_state": {"centre": [0, 0], "box": [0.05, 0.05]}}},
+    "repeat with steps": {"problem": {**AGAIN, "control_step": {"box": 1.5}}},
 }
 
 
@@ -216,10 +230,62 @@ def test_what_an_inner_loop_is_not_built_for_is_refused_by_name(name: str, tmp_p
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("key", ["observer", "prestabilise", "gains"])
+def test_a_certificate_of_another_loop_of_outputs_is_refuted(key: str, sensed: Path, tmp_path: Path) -> None:
+    forged = shutil.copytree(sensed, tmp_path / "forged")
+    data = json.loads((forged / "certificate.json").read_text())
+    data[key] = (np.array(data[key]) * (1.0 + 1e-6)).tolist()
+    (forged / "certificate.json").write_text(json.dumps(data))
+    failed = {claim.name for claim in sr.check(forged).claims if claim.verdict == "fails"}
+    assert {"path", "terminal", "cost", "lower bound"} & failed
+
+
+@pytest.fixture(scope="module")
+def sensed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    outcome = run(
+        posed(problem=LATE, policy={"cost": "nominal", "among": None}), tmp_path_factory.mktemp("sensed") / "run"
+    )
+    assert outcome.status == "certified" and set(verdicts(outcome).values()) == {"holds"}
+    return outcome.directory
+
+
+@pytest.mark.slow
+def test_a_controller_of_outputs_acts_on_its_estimates(sensed: Path) -> None:
+    """Stepped by exponentials beside it: ``u_k`` from predictions that stop at what is known, and ``covered``."""
+    with np.load(sensed / "solution.npz") as solution:
+        K, M, L, theta = (solution[name] for name in ("prestabilise", "gains", "observer", "theta"))
+    flow = expm(0.2 * np.array([[0.0, 1.0, 0.0], [9.0, 0.0, 1.0], [0.0, 0.0, 0.0]]))[:2]
+    rng, controller = np.random.default_rng(2), sr.controller(sensed)
+    state, predicted = np.array([0.11, -0.01]), [np.array([0.1, 0.0])]
+    innovations, applied = list[np.ndarray](), list[np.ndarray]()
+    for k in range(10):
+        y = state[:1] + rng.uniform(-0.005, 0.005)
+        innovations.append(y - predicted[k][:1])
+        known = max(0, k - 1)  # 0.3 s is two pieces
+        estimate = predicted[known]
+        for j in range(known, k):
+            estimate = flow[:, :2] @ estimate + flow[:, 2] * applied[j]
+        u = theta[:, k] + K[k] @ estimate + sum(M[k, j] @ e for j, e in enumerate(innovations))
+        assert controller.step(0.2 * k, y) == pytest.approx(u, rel=1e-8, abs=1e-10) and controller.covered
+        applied.append(u)
+        predicted.append(flow[:, :2] @ predicted[k] + flow[:, 2] * u + L[k] @ innovations[k])
+        state = flow[:, :2] @ state + flow[:, 2] * (u + rng.uniform(-0.1, 0.1))
+    assert not sr.loop(sensed, trajectories=2).contradicts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("of", ["disturbance", "initial_state"])
+@pytest.mark.parametrize("measured", [{}, OUTPUTS])
+def test_margins_are_those_without(of: str, measured: dict[str, Any]) -> None:
+    few = {"control": {"name": "piecewise_constant", "pieces": 6}}
+    found, other = (sr.margin(posed(gain, problem=measured, dictionaries=few), of) for gain in ("auto", None))
+    assert found.status == other.status == "certified"
+    assert found.lower <= other.upper and other.lower <= found.upper
+
+
+@pytest.mark.slow
 def test_studies_that_do_not_know_an_inner_loop_say_so(honest: Path, tmp_path: Path) -> None:
     options = posed()
-    with pytest.raises(InputError, match=r"policy\.prestabilise"):
-        sr.margin(options, out=tmp_path / "margin")
     with pytest.raises(InputError, match=r"policy\.prestabilise"):
         sr.initial_states(options, out=tmp_path / "states")
     with pytest.raises(InputError, match=r"prestabilise: null"):

@@ -17,7 +17,7 @@ from flint import arb, arb_mat
 from sparserob_core.checker.arithmetic.balls import ball, balls, below
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import exactly, stacked
-from sparserob_core.checker.claims.case import STEP, Case, number, numbers, shaped
+from sparserob_core.checker.claims.case import STEP, Case, number, numbers, observer_gains, shaped
 from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow, steps
 from sparserob_core.checker.cost.effort import prove_effort_limit
 from sparserob_core.checker.cost.gains import GainsBound
@@ -69,13 +69,10 @@ class VerifiedFeedback:
 
     @cached_property
     def observer(self) -> Array | None:
-        """The observer gains ``(K, d, p)`` that make innovations of the outputs; ``None`` without answered outputs. Any
-        gains that are written are valid."""
-        case = self.case
-        if case.problem.measurements is None or not case.answering:
-            return None
-        shape = case.control.pieces, case.problem.system.states, case.problem.measurements.outputs
-        return shaped(case.certificate, "observer", shape)
+        """The observer gains ``(K, d, p)`` that make innovations of the outputs (`observer_gains`); ``None`` without
+        answered outputs."""
+        gains = observer_gains(self.case)
+        return gains if gains.size else None
 
     @cached_property
     def loop(self) -> VerifiedLoop:
@@ -230,12 +227,15 @@ class VerifiedFeedback:
     def range(self) -> ConvexSet:
         """The set of the decided part of the control on every piece, with its answers: the set of the control, or
         beside an inner loop a box that is wider by what that loop may add."""
-        return self.case.inner.widen(self.case.problem.control, lambda: _collect_inputs(self.case))
+        case = self.case
+        return case.inner.widen(
+            case.problem.control, lambda: _collect_inputs(case, self.loop_at_rest.bound_missing(case.inner.gains))
+        )
 
     def on_decided(self, row: ConstraintRow, named: NamedDeviations) -> ConstraintRow:
         """Return a row of the control under named deviations as one of its decided part, which is the same without an
         inner loop."""
-        constant, slope = self.case.inner.on_decided(row.slope, lambda: named.entering)
+        constant, slope = self.case.inner.on_decided(row.slope, lambda: (named.entering, named.errors))
         return replace(row, constant=row.constant + constant, slope=slope)
 
     @cached_property
@@ -275,8 +275,8 @@ class VerifiedFeedback:
         return NamedDeviations(self.case, named.loop, [*inner_deviations, deviation])
 
 
-def _collect_inputs(case: Case) -> PlantInputs:
-    """Return what drives the plant, and what bounds its states."""
+def _collect_inputs(case: Case, missing: Array) -> PlantInputs:
+    """Return what drives the plant, what bounds its states, and what is ``missing (m,)`` in a feedback of them."""
     states, initial = balls(np.asarray(case.problem.initial_state)), case.problem.initial_set
     if initial is not None:
         states = [x + deviation for x, deviation in zip(states, _span(initial), strict=True)]
@@ -284,7 +284,7 @@ def _collect_inputs(case: Case) -> PlantInputs:
     if case.problem.disturbance is not None:
         disturbance = _span(case.problem.disturbance)
     columns = [arb_mat(len(values), 1, values) for values in (states, _span(case.problem.control), disturbance)]
-    return PlantInputs(columns[0], columns[1], columns[2], _bound_states(case))
+    return PlantInputs(columns[0], columns[1], columns[2], _bound_states(case), missing)
 
 
 def _bound_states(case: Case) -> list[StateBound]:
@@ -344,18 +344,13 @@ class NamedDeviations:
 
     @property
     def entering(self) -> list[list[arb]]:
-        """Contribution of the deviations to the state at every breakpoint since the one before, ``(K, d)``, where the
-        whole state is measured."""
-        return [
-            [
-                sum(
-                    (response[s, b] * x for block, response in responses.items() for b, x in enumerate(self.z[block])),
-                    ball(0),
-                )
-                for s in range(self.loop.outputs)
-            ]
-            for responses in self.loop.innovation_matrices
-        ]
+        """Contribution of the deviations to the state at every breakpoint since the one before, ``(K, d)``."""
+        return self._see(self.z, self.loop.entering_effects, self.case.problem.system.states)
+
+    @property
+    def errors(self) -> list[list[arb]]:
+        """Errors of the states that the control knows at every breakpoint, ``(K, d)``; 0 where these are measured."""
+        return self._see(self.z, self.loop.estimation_errors, self.case.problem.system.states)
 
     @property
     def middles(self) -> NamedDeviations:
@@ -368,6 +363,21 @@ class NamedDeviations:
         rounded middle may lie outside of a thin set, and differences from it outside of its span."""
         pairs = zip(self.z, self.loop.deviations.rests, strict=True)
         return [[ball(0)] * len(z) if z is rest else [x - r for x, r in zip(z, rest, strict=True)] for z, rest in pairs]
+
+    @staticmethod
+    def _see(z: Sequence[Sequence[arb]], effects: Sequence[Mapping[int, arb_mat]], count: int) -> list[list[arb]]:
+        """Return the ``count`` entries at every breakpoint that deviations make block by block, with these
+        ``effects``."""
+        return [
+            [
+                sum(
+                    (response[s, b] * x for block, response in responses.items() for b, x in enumerate(z[block])),
+                    ball(0),
+                )
+                for s in range(count)
+            ]
+            for responses in effects
+        ]
 
     def given(self, direction: Array, time: float) -> arb:
         """Return the contribution of disturbance and initial state to ``c'x(t)``, ``c (d,)``, without control."""

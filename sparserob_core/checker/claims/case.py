@@ -297,8 +297,8 @@ def _read_inner_gains(case: Case) -> Array:
     if case.policy is None or case.policy.inner_gain is None:
         return np.zeros((0, 0, 0))
     problem, system = case.problem, case.problem.system
-    if problem.measurements is not None or system.delay > 0.0 or problem.repeat:
-        raise Unchecked("the checker knows an inner loop beside states that are measured at once, for one period")
+    if system.delay > 0.0 or (problem.repeat and problem.control_step is not None):
+        raise Unchecked("the checker knows an inner loop of controls that act at once, without steps between periods")
     if system.parameter_count or system.varies:
         raise Unchecked("the checker knows an inner loop of known systems that do not change with time")
     return shaped(case.certificate, "prestabilise", (case.control.pieces, system.controls, system.states))
@@ -309,6 +309,7 @@ def lost_by(case: Case) -> float:
     there; no claim rests on it."""
     try:
         gains = _read_inner_gains(case)
+        corrections = _read_corrections(case)
     except (Broken, Unchecked):  # the claims about them say so
         return 0.0
     matrices = (
@@ -316,7 +317,23 @@ def lost_by(case: Case) -> float:
         if gains.size
         else []
     )
-    return lost_digits(matrices, np.diff(case.control.breakpoints), gains)
+    return lost_digits(matrices, np.diff(case.control.breakpoints), gains, corrections)
+
+
+def _read_corrections(case: Case) -> Array:
+    """Return the products ``L_k C (K, d, d)`` of an observer; an empty array where states are measured."""
+    observer, measurements = observer_gains(case), case.problem.measurements
+    return observer @ np.asarray(measurements.C) if measurements is not None and observer.size else observer
+
+
+def observer_gains(case: Case) -> Array:
+    """Return the observer gains ``(K, d, p)`` that make innovations of the outputs; an empty array without answered
+    outputs. Any gains that are written are valid."""
+    measurements = case.problem.measurements
+    if measurements is None or not case.answering:
+        return np.zeros((0, 0, 0))
+    shape = case.control.pieces, case.problem.system.states, measurements.outputs
+    return shaped(case.certificate, "observer", shape)
 
 
 def _make_window(

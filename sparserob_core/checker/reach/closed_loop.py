@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 from flint import arb, arb_mat
 
-from sparserob_core.checker.arithmetic.balls import ball, balls
+from sparserob_core.checker.arithmetic.balls import above, ball, balls
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import around, exactly, identity, stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
@@ -121,32 +121,64 @@ class VerifiedLoop:
         Phi, _, Delta = self.flow.over(self.grid[piece], self.grid[piece + 1])
         return Phi.matrix, Delta.matrix
 
-    @cached_property
+    @property
     def innovation_matrices(self) -> list[dict[int, arb_mat]]:
         """The matrices ``D_jl (p, mw)`` of every innovation ``j``, by block ``l``; blocks without effect are absent."""
-        return self._entering_effects if self.measured is None else self._compute_observer_innovations(self.measured)
+        return self._measured_effects[0]
 
-    def _compute_observer_innovations(self, measured: Measurements) -> list[dict[int, arb_mat]]:
-        """Return ``D_jl`` of the innovations of the observer. Its error is propagated from breakpoint to breakpoint,
-        less its correction."""
+    @property
+    def estimation_errors(self) -> list[dict[int, arb_mat]]:
+        """The matrices ``(d, mw)`` from every block to the error of the state that the control knows at a breakpoint;
+        none where the state is measured."""
+        return self._measured_effects[1]
+
+    @cached_property
+    def _measured_effects(self) -> tuple[list[dict[int, arb_mat]], list[dict[int, arb_mat]]]:
+        """The `innovation_matrices` and the `estimation_errors`."""
+        if self.measured is None:
+            return self.entering_effects, [{} for _ in self.entering_effects]
+        return self._compute_observer_effects(self.measured)
+
+    def _compute_observer_effects(
+        self, measured: Measurements
+    ) -> tuple[list[dict[int, arb_mat]], list[dict[int, arb_mat]]]:
+        """Return ``D_jl`` of the innovations of the observer, and the errors of its estimates. Its error is propagated
+        from breakpoint to breakpoint, less its correction."""
         assert self.observer is not None
         C = exactly(np.asarray(measured.C))
-        unit = identity(self.outputs)
+        unit, noise = identity(self.outputs), self.deviations.initial_block > self.deviations.blocks
+        is_known = measured.known(np.array(self.breakpoints))
         innovations: list[dict[int, arb_mat]] = []
+        errors: list[dict[int, arb_mat]] = []
         error: dict[int, arb_mat] = {}
-        for j, entering in enumerate(self._entering_effects):
-            for block, effect in entering.items():
-                error[block] = error[block] + effect if block in error else effect
+        for j, entering in enumerate(self.entering_effects):
+            error = _add_blocks(error, entering)
+            late = self._add_late_innovations(innovations, np.flatnonzero(~is_known[j, :j]).tolist())
+            errors.append(_add_blocks(error, late))
             innovation = {block: C * effect for block, effect in error.items()}
-            if self.deviations.initial_block > self.deviations.blocks:
+            if noise:
                 innovation[self.deviations.blocks + j] = unit
             innovations.append(innovation)
             if j + 1 == len(self.breakpoints) - 1:
                 break
+            # one transition of the error, since signs that are lost in balls are not found again
+            L = exactly(self.observer[j])
+            transition = self._breakpoint_transitions[j] - L * C
+            error = {block: transition * effect for block, effect in error.items()}
+            if noise:
+                error[self.deviations.blocks + j] = -L
+        return innovations, errors
+
+    def _add_late_innovations(self, innovations: list[dict[int, arb_mat]], late: list[int]) -> dict[int, arb_mat]:
+        """Return what the innovations at the breakpoints ``late``, the last ones so far, add to the prediction of the
+        state, ``(d, mw)`` by block."""
+        assert self.observer is not None
+        added: dict[int, arb_mat] = {}
+        for j in late:
             L, flow = exactly(self.observer[j]), self._breakpoint_transitions[j]
-            error = {block: flow * error[block] - L * effect if block in error else -L * effect
-                     for block, effect in innovation.items()}  # fmt: skip
-        return innovations
+            added = {block: flow * effect for block, effect in added.items()}
+            added = _add_blocks(added, {block: L * effect for block, effect in innovations[j].items()})
+        return added
 
     @cached_property
     def _breakpoint_transitions(self) -> list[arb_mat]:
@@ -157,7 +189,7 @@ class VerifiedLoop:
         return transitions
 
     @cached_property
-    def _entering_effects(self) -> list[dict[int, arb_mat]]:
+    def entering_effects(self) -> list[dict[int, arb_mat]]:
         """The effect ``(d, mw)`` of every block on the state at a breakpoint of the control, as far as it entered since
         the breakpoint before; at the first breakpoint, the initial deviation."""
         K = len(self.breakpoints) - 1
@@ -248,7 +280,8 @@ class VerifiedLoop:
 
     @remembered()
     def _decide(self, k: int) -> arb_mat:
-        """Return the `inputs` on a piece of the control, without what the inner loop adds."""
+        """Return the `inputs` on a piece of the control, without the feedback of the state by the inner loop, but with
+        the part of it that is missing where outputs are measured."""
         starts, zero = self.deviations.starts, ball(0)
         if k < 0:
             return stacked([[ball(v), *[zero] * starts[-1]] for v in self.before])
@@ -256,10 +289,28 @@ class VerifiedLoop:
         for j in np.flatnonzero(self.gains[k].any(axis=(1, 2))).tolist():
             M = exactly(self.gains[k, j])
             for block, matrix in self.innovation_matrices[j].items():
-                for row, values in zip(rows, (M * matrix).tolist(), strict=True):
-                    for b, value in enumerate(values, 1 + starts[block]):
-                        row[b] = row[b] + value
+                self._add_response(rows, block, M * matrix)
+        for block, matrix in self.estimation_errors[k].items() if self.inner.size else ():
+            self._add_response(rows, block, -exactly(self.inner[k]) * matrix)
         return stacked(rows)
+
+    def _add_response(self, rows: list[list[arb]], block: int, response: arb_mat) -> None:
+        """Add a ``response (m, mw)`` to one block of the deviations to ``rows (m, 1 + Q)``."""
+        for row, values in zip(rows, response.tolist(), strict=True):
+            for b, value in enumerate(values, 1 + self.deviations.starts[block]):
+                row[b] = row[b] + value
+
+    def bound_missing(self, gains: Array) -> Array:
+        """Return upper bounds ``(m,)`` of what feedbacks ``gains (K, m, d)`` of the state at the breakpoints do not
+        know of it, under any deviation; 0 where the state is measured."""
+        largest = np.zeros(gains.shape[1])
+        for gain, errors in zip(gains, self.estimation_errors, strict=True):
+            rows = [[ball(0.0)] * (1 + self.deviations.starts[-1]) for _ in largest]
+            for block, matrix in errors.items():
+                self._add_response(rows, block, exactly(gain) * matrix)
+            both = [[self.deviations.support([sign * x for x in row[1:]]) for sign in (1, -1)] for row in rows]
+            largest = np.maximum(largest, [above(high.max(low)) for high, low in both])
+        return largest
 
     def answers(self, k: int) -> arb_mat:
         """Return the answers on a piece of the control with 0 as nominal control, ``(m, 1 + Q)``."""
@@ -297,3 +348,11 @@ class VerifiedLoop:
         enclosure = Enclosed.of(line * (around(remainder) * augmented))
         total += 2.0 * (np.abs(enclosure.mid) + enclosure.rad)
         return np.asarray(total @ sizes * (1.0 + rounding(sizes.size)) * OUTWARD)
+
+
+def _add_blocks(effects: dict[int, arb_mat], added: dict[int, arb_mat]) -> dict[int, arb_mat]:
+    """Return the sums of two effects, block by block."""
+    return {
+        **effects,
+        **{block: effects[block] + effect if block in effects else effect for block, effect in added.items()},
+    }

@@ -55,12 +55,15 @@ class PlantInputs:
         Balls that contain the initial state ``(d, 1)``, the control ``(m, 1)`` and the disturbance ``(mw, 1)``.
     bounds
         The constraints on the state.
+    missing
+        Bounds ``(m,)`` of what the feedback does not know of the state.
     """
 
     initial: arb_mat
     control: arb_mat
     disturbance: arb_mat
     bounds: Sequence[StateBound]
+    missing: Array
 
 
 @final
@@ -140,7 +143,9 @@ class VerifiedInnerLoop:
         return controls
 
     def on_decided(
-        self, slope: list[list[arb]], deviations: Callable[[], Sequence[Sequence[arb]]]
+        self,
+        slope: list[list[arb]],
+        deviations: Callable[[], tuple[Sequence[Sequence[arb]], Sequence[Sequence[arb]]]],
     ) -> tuple[arb, list[list[arb]]]:
         """Return ``sum_k slope_k u_k`` as a constant, and slopes of the decided part of the control.
 
@@ -150,7 +155,7 @@ class VerifiedInnerLoop:
             Slopes ``(K, m)`` of the control.
         deviations
             A function that gives what deviations add to the nominal state at every breakpoint since the one before,
-            ``(K, d)``.
+            and the errors of the states that the feedback acts on, ``(K, d)`` each.
 
         Returns
         -------
@@ -160,11 +165,13 @@ class VerifiedInnerLoop:
             Slopes ``(K, m)`` of the decided part, and of the answers to innovations.
         """
         row = zeros(1, self.gains.shape[2])
-        constant, slopes, entering = ball(0.0), list[list[arb]](), deviations()
+        constant, slopes, (entering, errors) = ball(0.0), list[list[arb]](), deviations()
         for k in range(len(self.gains) - 1, -1, -1):
             Phi, Gamma, _, _ = self.plant[k]
             on_control = stacked([slope[k]]) + row * Gamma
-            row = row * Phi + on_control * self.matrices[k]
+            on_state = on_control * self.matrices[k]
+            constant = constant - (on_state * stacked([[v] for v in errors[k]]))[0, 0]
+            row = row * Phi + on_state
             slopes.append(on_control.entries())
             added = stacked([[v] for v in entering[k]])
             constant = constant + (row * (self.entering[k] + added))[0, 0]
@@ -175,7 +182,9 @@ class VerifiedInnerLoop:
         plant that ``collect`` gives. It is a box."""
         inputs = collect()
         # deviations are counted from middles, which rounding may move out of thin sets
-        sizes = ROUNDED * (np.array([above(abs(u)) for u in inputs.control.entries()]) + self.reach(inputs))
+        sizes = ROUNDED * (
+            np.array([above(abs(u)) for u in inputs.control.entries()]) + self.reach(inputs) + inputs.missing
+        )
         return Box(-sizes, sizes)
 
     def reach(self, inputs: PlantInputs) -> Array:
@@ -228,7 +237,9 @@ class NoInnerLoop:
         return decided
 
     def on_decided(
-        self, slope: list[list[arb]], deviations: Callable[[], Sequence[Sequence[arb]]]
+        self,
+        slope: list[list[arb]],
+        deviations: Callable[[], tuple[Sequence[Sequence[arb]], Sequence[Sequence[arb]]]],
     ) -> tuple[arb, list[list[arb]]]:
         """Return the constant 0 and the same ``slope``, whatever the deviations are."""
         return ball(0.0), slope
@@ -292,33 +303,46 @@ def _narrow(state: arb_mat, rows: list[list[arb]], values: list[arb]) -> arb_mat
     return stacked([[before if above(before.rad()) <= above(after.rad()) else after] for before, after in pairs])
 
 
-def lost_digits(plants: Sequence[Sequence[Array]], lengths: Array, gains: Array) -> float:
+def lost_digits(
+    plants: Sequence[Sequence[Array]], lengths: Array, gains: Array, corrections: Sequence[Array] | Array = ()
+) -> float:
     """Return the exponent of what balls and multipliers lose beside gains ``(K, m, d)`` on pieces of ``lengths (K,)``;
-    0 without gains. ``plants`` are the matrices ``(A, B)`` of every mode.
+    0 without gains. ``plants`` are the matrices ``(A, B)`` of every mode, and ``corrections`` the products
+    ``L_k C (d, d)`` of an observer on every piece, where outputs are measured.
 
     Rows in states lose what the plant amplifies by, their adjoints and products of both as much again. The states of
-    the loop lose what the sizes of its transitions amplify by, as signs are lost in balls.
+    the loop, and the errors of an observer, lose what the sizes of their transitions amplify by, as signs are lost in
+    balls.
     """
-    exponent, wrapped = 0.0, np.ones(gains.shape[2])
     if not gains.size:
-        return exponent
-    for length, gain in zip(lengths, gains, strict=True):
-        sizes = max((_wrap(A, B, length, gain) @ wrapped for A, B in plants), key=np.sum)
-        exponent, wrapped = exponent + max(0.0, float(np.log(sizes.max()))), sizes / sizes.max()
+        return 0.0
+    steps = [[_step(A, B, length) for A, B in plants] for length in lengths]
+    exponent = _wrap([[Phi + Gamma @ K for Phi, Gamma in step] for step, K in zip(steps, gains, strict=True)])
+    exponent += _wrap([[Phi - LC for Phi, _ in step] for step, LC in zip(steps, corrections, strict=False)])
     rates = [float(np.linalg.eigvals(A).real.max()) for A, _ in plants]
     return GROWTHS * float(lengths.sum()) * max(0.0, *rates) + exponent
 
 
-def _wrap(A: Array, B: Array, length: float, gain: Array) -> Array:
-    """Return the sizes ``(d, d)`` of a transition of the state over a piece with its feedback."""
+def _wrap(steps: Sequence[Sequence[Array]]) -> float:
+    """Return the exponent by which the sizes of transitions ``(d, d)`` amplify, one after the other, in the worst mode
+    of each."""
+    exponent, wrapped = 0.0, None
+    for modes in steps:
+        wrapped = np.ones(len(modes[0])) if wrapped is None else wrapped
+        sizes = max((np.abs(mode) @ wrapped for mode in modes), key=np.sum)
+        exponent, wrapped = exponent + max(0.0, float(np.log(sizes.max()))), sizes / sizes.max()
+    return exponent
+
+
+def _step(A: Array, B: Array, length: float) -> tuple[Array, Array]:
+    """Return the transition of the state ``(d, d)`` over a piece, and its response to a control ``(d, m)``."""
     from scipy.linalg import expm
 
     d, m = B.shape
     whole = np.zeros((d + m, d + m))
     whole[:d] = np.hstack([A, B]) * length
     flow = expm(whole)[:d]
-    sizes: Array = np.abs(flow[:, :d] + flow[:, d:] @ gain)
-    return sizes
+    return flow[:, :d], flow[:, d:]
 
 
 def _part_modes(Phi: Array) -> Array:

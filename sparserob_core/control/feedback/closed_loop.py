@@ -1,7 +1,7 @@
 """State of the closed loop at all times: an exact affine function of the deviations.
 
 With the effects ``F`` of the gains, the control on piece ``k`` is ``u_k = v_k + F_k w`` (with an `InnerLoop`, plus
-``K_k x(tau_k)``), and the state is
+``K_k x(tau_k)``, less what it does not know of ``x(tau_k)`` where outputs are measured), and the state is
 ``x(t) = x_v(t) + sum_q y_q(t) w_q``. Every response ``y_q`` is the state of the same system from 0, driven by column
 ``q`` of the effects and by its own entry of the disturbance. Where the initial states are a set, the last entries of
 ``w`` are deviations of the initial state, and their responses begin at its unit vectors.
@@ -98,10 +98,26 @@ class ClosedLoop:
         return np.asarray(decided + inner.gains @ self.path(x)[0][self.firsts])
 
     def decided(self, x: Array) -> Array:
-        """Return the decided part of `controls`, without what the inner loop adds, ``(K, m, 1 + Q)``."""
+        """Return the part of `controls` without the feedback ``K_k x(tau_k)`` of the inner loop, ``(K, m, 1 + Q)``.
+        It is what is decided, with the `missing` part of this feedback."""
         nominal = x[: self.nominal_size].reshape(-1, self.functionals.dictionary.pieces)
         effects = self.answers.effects(x[self.nominal_size : self.nominal_size + self.answers.variables])
+        effects = effects + self.missing if self.inner.acts else effects
         return np.concatenate([nominal.T[:, :, None], effects], axis=2)
+
+    @cached_property
+    def missing(self) -> Array:
+        """Responses ``(K, m, Q)`` of what the inner loop adds to the control to the errors of the states that it acts
+        on, which no decision changes; 0 where states are measured."""
+        return np.asarray(-self.inner.gains @ self._measured[1])
+
+    @cached_property
+    def widest(self) -> Array:
+        """Upper bounds ``(m,)`` of the `missing` part of the control under any deviation; 0 without an inner loop."""
+        if not self.inner.acts:
+            return np.zeros(self.answers.shape[1])
+        bounds = np.maximum(self.spread.support(self.missing), self.spread.support(-self.missing))
+        return np.asarray(bounds.max(axis=0))
 
     @property
     def inner(self) -> InnerLoop:
@@ -182,9 +198,15 @@ class ClosedLoop:
         point = (self.spread.middle + deviation)[self.noise]
         return point.reshape(self.answers.shape[0], -1) if point.size else None
 
-    @cached_property
+    @property
     def innovations(self) -> Array:
         """Matrices ``(K, p, Q)`` from all deviations to every innovation."""
+        return self._measured[0]
+
+    @cached_property
+    def _measured(self) -> tuple[Array, Array]:
+        """Matrices from all deviations to every innovation, ``(K, p, Q)``, and to the errors of the states that the
+        control knows, ``(K, d, Q)``."""
         problem, initial_count = self.functionals, int(self.begins.sum())
         state_innovations = build_innovations(
             problem.response, problem.dictionary, problem.disturbance, initial_count > 0

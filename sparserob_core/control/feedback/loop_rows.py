@@ -47,6 +47,8 @@ class LoopRows:
         rows, columns = np.nonzero(on_control)
         g = table_of(rows, columns, on_control[rows, columns], (count, self.loop.variables))
         d = np.einsum("pli,liq->pq", on_noise[firsts], self.loop.entries) + free[firsts] @ self.loop.begins
+        if self.loop.inner.acts:
+            d += self._weigh_missing(on_control[firsts].reshape(len(firsts), m, K).swapaxes(1, 2))
         return UncertainRows(g, h - offset, part, factor, tuple(matrices), d)
 
     def with_control(self, rows: UncertainRows, G: Array, pieces: np.ndarray, following: bool = False) -> UncertainRows:
@@ -87,7 +89,13 @@ class LoopRows:
         functional = self.loop.functionals.response.weigh_controls(controls)
         added = self._of_weights(functional, np.zeros(len(controls)), rows.part, rows.factor)
         matrices = tuple(csr_array(C + more) for C, more in zip(rows.C, added.C, strict=True))
-        return replace(rows, g=csr_array(rows.g + added.g), h=rows.h + added.h, C=matrices, d=rows.d + added.d)
+        d = rows.d + added.d + self._weigh_missing(controls[_find_firsts(rows.part)])
+        return replace(rows, g=csr_array(rows.g + added.g), h=rows.h + added.h, C=matrices, d=d)
+
+    def _weigh_missing(self, controls: Array) -> Array:
+        """Return the responses ``(r, Q)`` of ``sum_k W_k u_k``, of weights ``controls (r, K, m)``, to what the inner
+        loop does not know of the state."""
+        return np.asarray(np.einsum("rkm,kmq->rq", controls, self.loop.missing))
 
     def of_control(self, piece: int, H: Array, h: Array, extra: Array | None = None) -> UncertainRows:
         """Return the rows ``H u_k <= h`` on one piece for every deviation; ``extra (r, n)`` is added on the left."""

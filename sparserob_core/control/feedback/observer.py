@@ -5,11 +5,15 @@ disturbance add) + L_j (y_j - C x^_j - v_m)`` with the middle ``v_m`` of the noi
 on the control. So the innovations ``e_j = y_j - C x^_j - v_m`` are linear in the deviations of the disturbance, of the
 noise and of the initial state, whatever the gains are. Where every innovation is answered, any ``L`` gives the same
 policies.
+
+An inner loop acts on the estimate at breakpoint ``k`` that the control knows then. With a latency that is ``x^_k`` less
+what the innovations add to it that are known only later.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -53,6 +57,8 @@ class Observer:
         Middle of the noise.
     noisy : bool
         Whether there is a noise.
+    known : ndarray of int, shape (K,)
+        Number of earlier measurements that every piece of the control knows.
     """
 
     C: Array
@@ -60,9 +66,10 @@ class Observer:
     flows: Array
     middle: Array
     noisy: bool
+    known: np.ndarray
 
     @staticmethod
-    def of(measured: Measurements, input_effects: Array, flows: Array, radii: Array) -> Observer:
+    def of(measured: Measurements, input_effects: Array, flows: Array, radii: Array, breakpoints: Array) -> Observer:
         """Return the one-step predictor of Kalman (1960) for deviations of given sizes, a stable observer.
 
         Where the outputs determine the whole state and there is no noise, it predicts from the last measurement alone.
@@ -77,6 +84,8 @@ class Observer:
             Transitions of the state from each breakpoint to the next.
         radii : ndarray, shape (Q,)
             Largest deviations.
+        breakpoints : ndarray, shape (K + 1,)
+            Breakpoints of the control.
         """
         C, K = np.asarray(measured.C), input_effects.shape[0]
         p, d = C.shape
@@ -98,16 +107,39 @@ class Observer:
                 + (L[j] * noise**2) @ L[j].T
                 + input_factors[j + 1] @ input_factors[j + 1].T
             )
-        return Observer(C, L, flows, middle, measured.noise is not None)
+        known_count = np.tril(measured.known(breakpoints), -1).sum(axis=1)
+        return Observer(C, L, flows, middle, measured.noise is not None, known_count)
 
     def outputs(self, states: Array, noise: Array | None = None) -> Array:
         """Return the outputs ``(p, n)`` of ``states (d, n)``, with the given ``noise`` or else the middle of the
         noise."""
         return np.asarray(self.C @ states + (self.middle[:, None] if noise is None else noise))
 
-    def compute_innovations(self, D: Array, initial_count: int) -> Array:
+    def estimate(self, k: int, predicted: Array, innovations: Sequence[Array] | Array) -> Array:
+        """Return the states ``(d, n)`` at breakpoint ``k`` as the control estimates them that begins there.
+
+        Parameters
+        ----------
+        k : int
+            The breakpoint.
+        predicted : ndarray, shape (d, n)
+            States that all earlier ``innovations`` predict.
+        innovations : sequence of ndarray, shape (p, n)
+            Innovations at the breakpoints so far.
+
+        Returns
+        -------
+        ndarray
+            The prediction, less what is added by innovations that are known only later.
+        """
+        added = np.zeros_like(predicted)
+        for j in range(int(self.known[k]), k):
+            added = self.flows[j] @ added + self.L[j] @ innovations[j]
+        return np.asarray(predicted - added)
+
+    def compute_innovations(self, D: Array, initial_count: int) -> tuple[Array, Array]:
         """Return the matrices ``(K, p, Q + K p)`` from all deviations to the innovations, or ``(K, p, Q)`` without a
-        noise.
+        noise, and those to the errors of the states that the control estimates, ``(K, d, ...)``.
 
         Disturbance and initial state enter the state as ``D (K, d, Q)`` from breakpoint to breakpoint. The entries of
         the noise stand before the last ``initial_count`` entries, which belong to the initial state.
@@ -118,33 +150,40 @@ class Observer:
             [D[:, :, : Q - initial_count], np.zeros((K, d, count)), D[:, :, Q - initial_count :]], axis=2
         )
         innovations, error = np.zeros((K, p, Q + count)), np.zeros((d, Q + count))
+        errors = np.zeros((K, d, Q + count))
         for j in range(K):
             error = error + inputs[j]
-            innovations[j] = self.C @ error
+            innovations[j], errors[j] = self.C @ error, -self.estimate(j, -error, innovations)
             if self.noisy:
                 first = Q - initial_count + j * p
                 innovations[j, :, first : first + p] += np.eye(p)
             if j + 1 < K:
                 error = self.flows[j] @ error - self.L[j] @ innovations[j]
-        return innovations
+        return innovations, errors
 
     def in_units(self, states: Array, outputs: Array) -> Observer:
         """Return the same observer in other units: one unit of a state before is ``states (d,)`` units after, and one
         unit of an output is ``outputs (p,)``."""
         C, L = self.C * outputs[:, None] / states, self.L * states[:, None] / outputs
-        return Observer(C, L, self.flows * states[:, None] / states, self.middle * outputs, self.noisy)
+        flows = self.flows * states[:, None] / states
+        return replace(self, C=C, L=L, flows=flows, middle=self.middle * outputs)
 
 
-def innovations_of(entering: Array, initial_count: int, observer: Observer | None, anew: bool) -> Array:
-    """Return the matrices ``(K, p, Q)`` from all deviations to the innovations.
+def innovations_of(entering: Array, initial_count: int, observer: Observer | None, anew: bool) -> tuple[Array, Array]:
+    """Return the matrices ``(K, p, Q)`` from all deviations to the innovations, and those ``(K, d, Q)`` to the errors
+    of the states that the control knows: 0 where states are measured.
 
     Disturbance and initial state enter the state as ``entering (K, d, Q')``. The entries of the noise stand before the
     last ``initial_count`` entries, which belong to the initial state. With ``anew``, as many entries of the next
     period's initial state stand between them; no measurement of this period depends on them.
     """
-    innovations = entering if observer is None else observer.compute_innovations(entering, initial_count)
-    return (
-        np.insert(innovations, np.full(initial_count, innovations.shape[2] - initial_count), 0.0, axis=2)
-        if anew
-        else innovations
+    tables = (
+        (entering, np.zeros_like(entering))
+        if observer is None
+        else observer.compute_innovations(entering, initial_count)
     )
+    if not anew:
+        return tables
+    at = np.full(initial_count, tables[0].shape[2] - initial_count)
+    innovations, errors = (np.insert(table, at, 0.0, axis=2) for table in tables)
+    return innovations, errors

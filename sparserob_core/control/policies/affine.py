@@ -45,8 +45,9 @@ class AffinePolicy(Policy, Options):
     """An innovation is answered for so long at most, in the time unit of the problem; everything by default."""
 
     prestabilise: Literal["auto"] | list[list[float]] | None = None
-    """A gain ``K (m, n)`` of the measured state, for plants that amplify: ``u_k = K x(tau_k) + v_k + sum_j M_kj e_j``.
-    The policies are the same (with ``memory`` other ones), and all numbers are those of the plant under this feedback.
+    """A gain ``K (m, n)`` of the state, measured or estimated from outputs, for plants that amplify: ``u_k = K x(tau_k)
+    + v_k + sum_j M_kj e_j``. The policies are the same (with ``memory`` other ones), and all numbers are those of the
+    plant under this feedback.
     ``auto``: the gains of a regulator, one for every piece. null: none."""
 
     causal_signals: int = Field(default=40, ge=0, le=1000)

@@ -86,6 +86,12 @@ class Measuring:
             return self._prediction
         return np.asarray(self._prediction + observer.L[len(self._innovations) - 1] @ self._innovations[-1])
 
+    def _estimate_states(self, k: int, measured: Array, predicted: Array) -> Array:
+        """Return the states ``(d, n)`` that the inner loop acts on: those that are ``measured``, or of outputs an
+        estimate."""
+        observer = self._get_loop().observer
+        return measured if observer is None else observer.estimate(k, predicted, self._innovations)
+
     def predicted(self) -> Array:
         """Return the prediction of the measurements ``(p, n)`` as the next piece begins, at which the innovation is
         0."""
@@ -115,7 +121,7 @@ class Measuring:
             self._innovations.append(self._compute_innovations(now, predicted))
             u = np.repeat(self.nominal[:, k, None], now.shape[1], axis=1)
             if loop.inner.acts:
-                u = u + loop.inner.gains[k] @ now
+                u = u + loop.inner.gains[k] @ self._estimate_states(k, now, predicted)
             for j, innovation in enumerate(self._innovations):
                 if self.gains[k, j].any():
                     u = u + self.gains[k, j] @ innovation

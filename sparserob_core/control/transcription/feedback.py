@@ -180,7 +180,7 @@ class FeedbackModel(Acting):
                 H, h = H / measurements.steps[:, None], h / measurements.steps
             families.append(FeedbackControl(name, loop, places, H, h).family())
         axes, (low, high) = np.eye(problem.system.controls), ranges(problem.control)
-        widths = np.subtract(*reversed(ranges(posed.held.control)))
+        widths = np.subtract(*reversed(ranges(posed.held.control))) + 2.0 * loop.widest
         gain_bounds = gains.share * widths[gains.channel] / loop.spread.chords[gains.entry]
         magnitudes = np.repeat(np.maximum(np.abs(low), np.abs(high)), pieces)
         lower, upper, weights, largest = -gain_bounds, gain_bounds, None, None
@@ -258,11 +258,13 @@ def _build_measurements(
     if problem.measurements is not None and theirs.problem.measurements is not None:
         output_units = theirs.problem.measurements.units(units.states)
         radii = np.delete(spread.radii, np.arange(deviations.size, spread.size - initial_units.size))
-        observer = Observer.of(problem.measurements, innovations, between(own.response, own.control), radii)
+        flows, breakpoints = between(own.response, own.control), own.control.breakpoints
+        observer = Observer.of(problem.measurements, innovations, flows, radii, breakpoints)
         deviations = np.append(deviations, np.tile(output_units, own.control.pieces if observer.noisy else 0))
     begins_anew = _has_next_initial_state(own)
     deviations = np.concatenate([deviations, initial_units, *[initial_units] * begins_anew])
-    innovations = innovations_of(innovations, initial_units.size, observer, begins_anew) * (spread.radii > 0.0)
+    innovations, _ = innovations_of(innovations, initial_units.size, observer, begins_anew)
+    innovations = innovations * (spread.radii > 0.0)
     coordinates, (H, h) = (
         answers(spread.within(innovations), mask, problem.system.controls, innovations),
         fixed(problem),
@@ -402,9 +404,8 @@ def _refuse_inner_loop(problem: OptimalControlProblem) -> None:
     reasons = {
         "a plant that does not change with time": problem.system.varies,
         "a control without delay": problem.system.delay > 0.0,
-        "states that are measured at once and without noise": problem.measurements is not None,
         "a cost without quadratic terms and groups": not problem.cost.is_linear or bool(problem.cost.blocks),
-        "a plan that does not repeat": bool(problem.repeat),
+        "no control_step where a plan repeats": bool(problem.repeat) and problem.control_step is not None,
     }
     for wanted, hindered in reasons.items():
         if hindered:

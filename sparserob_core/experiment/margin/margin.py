@@ -204,8 +204,6 @@ def _build_search(
     )
     problem, control, disturbance = experiment.transcription.stated, experiment.control, experiment.disturbance
     policy = experiment.transcription.policy
-    if experiment.transcription.response.inner.acts:
-        raise InputError(path="policy.prestabilise", expected="null for a margin", got="an inner loop")
     if of == HORIZON:
         if policy is not None:
             raise InputError(path="policy.name", expected="open_loop for the margin of the horizon", got="feedback")

@@ -67,9 +67,13 @@ def test_the_nominal_control_is_what_the_loop_makes_of_its_decided_part(horizon:
 def test_a_row_on_the_control_is_the_same_on_its_decided_part() -> None:
     loop, rng = made(1.0, 6), np.random.default_rng(3)
     decided, added, slope = rng.normal(size=6), 0.1 * rng.normal(size=(6, 2)), rng.normal(size=6)
-    constant, slopes = loop.on_decided([[ball(s)] for s in slope], lambda: [balls(row) for row in added])
+    errors = 0.1 * rng.normal(size=(6, 2))  # of the states that the feedback acts on
+    constant, slopes = loop.on_decided(
+        [[ball(s)] for s in slope], lambda: ([balls(row) for row in added], [balls(row) for row in errors])
+    )
     found = float(constant) + sum(float(s) * v for (s,), v in zip(slopes, decided, strict=True))
-    assert found == pytest.approx(float(slope @ controls(loop, decided, added)), rel=1e-9)
+    acting = decided - np.einsum("kd,kd->k", loop.gains[:, 0], errors)
+    assert found == pytest.approx(float(slope @ controls(loop, acting, added)), rel=1e-9)
 
 
 def test_growth_by_e60_does_not_widen_the_nominal_control() -> None:
@@ -91,6 +95,7 @@ def test_the_range_holds_what_controls_that_keep_the_constraints_add(horizon: fl
         arb_mat([[ball(-reach).union(ball(reach))]]),
         arb_mat([[ball(MIDDLE[0])]]),
         [StateBound(np.eye(2), [arb_mat(2, 1, [(-w).union(w) for w in wall])] * (pieces + 1))],
+        np.zeros(1),
     )
     box = loop.widen(Box([-reach], [reach]), lambda: inputs)
     Phi, Gamma = step(loop.breakpoints[1])
@@ -120,7 +125,11 @@ def test_a_wall_that_holds_at_the_end_narrows_the_range() -> None:
         wall = arb_mat(2, 1, [(-w).union(w) for w in balls([0.5, 1.5])])
         bounds = [StateBound(np.eye(2), [*free, wall])] if name == "end" else []
         inputs = PlantInputs(
-            arb_mat(2, 1, balls(START)), arb_mat([[ball(-8.0).union(ball(8.0))]]), arb_mat([[ball(0.05)]]), bounds
+            arb_mat(2, 1, balls(START)),
+            arb_mat([[ball(-8.0).union(ball(8.0))]]),
+            arb_mat([[ball(0.05)]]),
+            bounds,
+            np.zeros(1),
         )
         box = loop.widen(Box([-8.0], [8.0]), partial(_same, inputs))
         ranges[name] = float(box.support(np.ones((1, 1)))[0])
@@ -143,11 +152,17 @@ def test_the_range_holds_every_initial_state(guess: float, monkeypatch: pytest.M
     monkeypatch.setattr(np.linalg, "pinv", lambda table: guess * least_squares(table))
     loop, sides = made(0.1, 1), np.array([0.5, 1.5])
     inputs = PlantInputs(
-        arb_mat(2, 1, [(-v).union(v) for v in balls(sides)]), arb_mat([[ball(0.0)]]), arb_mat([[ball(0.05)]]), []
+        arb_mat(2, 1, [(-v).union(v) for v in balls(sides)]),
+        arb_mat([[ball(0.0)]]),
+        arb_mat([[ball(0.05)]]),
+        [],
+        np.zeros(1),
     )
     least = 8.0 + float(np.abs(loop.gains[0, 0]) @ sides)
     inputs = replace(inputs, control=arb_mat([[ball(-8.0).union(ball(8.0))]]))
     assert float(loop.widen(Box([-8.0], [8.0]), partial(_same, inputs)).support(np.ones((1, 1)))[0]) >= least
+    unknown = replace(inputs, missing=np.array([0.7]))
+    assert float(loop.widen(Box([-8.0], [8.0]), partial(_same, unknown)).support(np.ones((1, 1)))[0]) >= least + 0.7
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -14,7 +14,7 @@ RADII = np.array([0.05])
 
 
 def observer(noise: sr.ConvexSet | None) -> Observer:
-    return Observer.of(sr.Measurements(C=[[1.0, 0.0]], noise=noise), SEEN, FLOWS, RADII)
+    return Observer.of(sr.Measurements(C=[[1.0, 0.0]], noise=noise), SEEN, FLOWS, RADII, np.arange(6.0))
 
 
 @pytest.mark.parametrize("centre", [0.5, -3.0, 1024.0])

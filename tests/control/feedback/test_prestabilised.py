@@ -13,9 +13,11 @@ from sparserob_core.control.feedback.loop_bounds import LoopBounds
 from sparserob_core.control.feedback.loop_rows import LoopRows
 from sparserob_core.control.feedback.prestabilised import SampledPlant, StateRows, part_modes
 from sparserob_core.control.policies.affine import AffinePolicy
+from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.sip.convex_set import Box
 
@@ -103,8 +105,17 @@ def most_added(
     return float(-found.fun)
 
 
-def looped() -> tuple[ClosedLoop, np.ndarray]:
+SENSED = Measurements([[1.0, 0.0]], Box([-0.02], [0.03]), latency=0.5)  # of pieces of 0.4: known two pieces later
+
+
+def looped(measured: Measurements | None = None) -> tuple[ClosedLoop, np.ndarray]:
     """The loop of a pendulum whose disturbance changes within pieces of the control, and a random decision."""
+    model = _prepared(measured)
+    assert model.feedback is not None and model.feedback.loop.inner.acts
+    return model.feedback.loop, np.random.default_rng(3).normal(size=model.program.n)
+
+
+def _prepared(measured: Measurements | None) -> Transcription:
     problem = OptimalControlProblem(
         system=LinearSystem([[0.0, 1.0], [9.0, 0.0]], [[0.0], [1.0]], [[0.0], [1.0]]),
         horizon=2.0,
@@ -112,11 +123,10 @@ def looped() -> tuple[ClosedLoop, np.ndarray]:
         control=Box([-8.0], [8.0]),
         disturbance=Box([-0.3], [0.3]),
         path=[Box([-0.5, -np.inf], [0.5, np.inf])],
+        measurements=measured,
     )
     control, pushes = (Dictionary.indicators(np.linspace(0.0, 2.0, count)) for count in (6, 8))
-    model = prepare(problem, control, pushes, policy=AffinePolicy(cost="peak", prestabilise="auto"))
-    assert model.feedback is not None and model.feedback.loop.inner.acts
-    return model.feedback.loop, np.random.default_rng(3).normal(size=model.program.n)
+    return prepare(problem, control, pushes, policy=AffinePolicy(cost="peak", prestabilise="auto"))
 
 
 def test_rounding_of_every_step_is_amplified_as_the_loop_amplifies_it() -> None:
@@ -154,8 +164,57 @@ def test_states_and_controls_of_the_loop_are_those_that_it_measures() -> None:
     assert last == pytest.approx(nodes[-1], rel=1e-9) and drives[-1][1, 0] == pytest.approx(controls[k, 0, 0])
 
 
-def test_rows_at_any_time_are_those_of_the_state_and_of_the_control() -> None:
-    loop, x = looped()
+def test_a_loop_of_outputs_acts_on_what_is_known_of_the_state() -> None:
+    """Stepped by hand: each control comes from predictions that stop at the last measurement that is known by then."""
+    loop, x = looped(SENSED)
+    assert loop.observer is not None and loop.observer.known.tolist() == [0, 0, 1, 2, 3]
+    whole = np.zeros((3, 3))
+    whole[:2, :2], whole[1, 2] = [[0.0, 1.0], [9.0, 0.0]], 1.0
+    loop_controls, nodes = loop.controls(x), loop.path(x)[0]
+    K, M, L, decided = loop.inner.gains, loop.gains(x), loop.observer.L, x[:5]
+    step = expm(0.4 * whole)[:2]
+    for deviation in 0.02 * np.random.default_rng(6).normal(size=(3, loop.spread.size)):
+        z = np.append(1.0, deviation)
+        states = nodes[loop.firsts] @ z
+        noise = deviation[loop.noise]  # from its middle
+        predicted, innovations, applied = [loop.start], list[float](), list[float]()
+        for k in range(5):
+            innovations.append(float(states[k, 0] + noise[k] - predicted[k][0]))
+            known = max(0, k - 1)  # measurements that are known; from there on predictions alone
+            estimate = predicted[known]
+            for j in range(known, k):
+                estimate = step[:, :2] @ estimate + step[:, 2] * applied[j]
+            u = float(K[k, 0] @ estimate + decided[k] + sum(M[k, j, 0, 0] * e for j, e in enumerate(innovations)))
+            applied.append(u)
+            onward = step[:, :2] @ predicted[k] + step[:, 2] * u + L[k][:, 0] * innovations[k]
+            predicted.append(onward)
+        assert (loop_controls @ z)[:, 0] == pytest.approx(applied, rel=1e-9, abs=1e-11)
+
+
+def test_what_a_loop_of_outputs_does_not_know_is_bounded_by_what_a_deviation_attains() -> None:
+    loop, _ = looped(SENSED)
+    rng, largest = np.random.default_rng(7), 0.0
+    vertices = [np.sign(row) * loop.spread.radii for row in loop.missing[:, 0]]
+    for deviation in (*vertices, *(rng.choice([-1.0, 1.0], loop.spread.size) * loop.spread.radii for _ in range(50))):
+        largest = max(largest, float(np.abs(loop.missing[:, 0] @ deviation).max()))
+    assert largest == pytest.approx(loop.widest[0], rel=1e-9)
+    assert not looped()[0].missing.any() and not looped()[0].widest.any()
+
+
+def test_gains_are_bounded_by_the_control_and_all_that_the_loop_adds() -> None:
+    """A gain is as large as the range of the decided part lets it be: the control, and what acts on the estimate."""
+    loop, _ = looped(SENSED)
+    answers, size = loop.answers, loop.nominal_size
+    program = _prepared(SENSED).program
+    reach = 8.0 + loop.inner.reach[0] + loop.widest[0]
+    expected = 2.0 * reach * answers.share / loop.spread.chords[answers.entry]
+    assert program.finite.upper[size : size + answers.variables] == pytest.approx(expected, rel=1e-12)
+    assert loop.widest[0] > 0.1
+
+
+@pytest.mark.parametrize("measured", [None, SENSED])
+def test_rows_at_any_time_are_those_of_the_state_and_of_the_control(measured: Measurements | None) -> None:
+    loop, x = looped(measured)
     H, none = np.array([[1.0, 0.0], [0.0, 1.0]]), np.zeros(2)
     rows = LoopRows(loop).of_state(1.234, H, none, np.arange(2), np.ones(2))
     state = loop.states(x, np.array([1.234]))[0]

@@ -93,7 +93,7 @@ def test_an_observer_predicts_with_the_least_error():
     K, d, p, Q = 4, 3, 2, 5
     C, seen, flows = rng.normal(size=(p, d)), rng.normal(size=(K, d, Q)), rng.normal(size=(K - 1, d, d))
     radii, noise = rng.uniform(0.5, 2.0, Q), Box([-0.2, -0.3], [0.2, 0.3])
-    found = Observer.of(sr.Measurements(C, noise), seen, flows, radii)
+    found = Observer.of(sr.Measurements(C, noise), seen, flows, radii, np.arange(K + 1.0))
     far = np.array([0.2, 0.3])
     assert not found.middle.any() and found.noisy and not found.L[-1].any()
 
@@ -120,9 +120,9 @@ def test_an_observer_predicts_with_the_least_error():
             moved = found.L.copy()
             moved[j] = other[j]
             assert mispredicted(moved)[j] > least[j]
-    whole = Observer.of(sr.Measurements(np.diag([2.0, 1.0, -1.0])), seen, flows, radii)
+    whole = Observer.of(sr.Measurements(np.diag([2.0, 1.0, -1.0])), seen, flows, radii, np.arange(K + 1.0))
     assert whole.L[0] @ np.diag([2.0, 1.0, -1.0]) == pytest.approx(flows[0]) and not whole.noisy
     states = rng.normal(size=(d, 6))
-    apart = Observer.of(sr.Measurements(C, Box([-0.3, -0.1], [0.1, 0.5])), seen, flows, radii)
+    apart = Observer.of(sr.Measurements(C, Box([-0.3, -0.1], [0.1, 0.5])), seen, flows, radii, np.arange(K + 1.0))
     assert apart.outputs(states) == pytest.approx(C @ states + np.array([[-0.1], [0.2]]))
     assert found.outputs(states, np.ones((p, 6))) == pytest.approx(C @ states + 1.0)

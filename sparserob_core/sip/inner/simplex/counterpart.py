@@ -443,11 +443,13 @@ class Counterpart:
         The slopes of a solver are as accurate as its tolerance. For variables that are ``free (n,)``, since no row has
         them as an entry of its own whose deviation balances them, the products of multipliers and deviations are
         corrected by least squares, for one entry of the deviations after another. Only deviations inside of their sets
-        are changed.
+        are changed, and only where this raises the bound: among rows that are nearly dependent, small slopes ask for
+        large changes of deviations, which cost more than the slopes.
         """
         if not self.spread.is_box or not (slope[free] != 0.0).any():
             return
-        parts: list[tuple[csr_array, np.ndarray, Array, float]] = []  # of each part its matrix, rows, signs and weight
+        # of each part its matrix, constants, rows, signs and weight
+        parts: list[tuple[csr_array, Array, np.ndarray, Array, float]] = []
         first = 0
         for block in self.blocks:
             for p in range(len(block.C)):
@@ -455,34 +457,55 @@ class Counterpart:
                 rows = rows[: rows.size // 2] if block.exact else rows  # the opposites of equations have no deviations
                 total = float(y[first + rows] @ np.abs(block.factor[rows]))
                 if total > 0.0:
-                    parts.append((block.C[p], first + rows, np.sign(block.factor[rows]), total))
+                    parts.append((block.C[p], block.d[p], first + rows, np.sign(block.factor[rows]), total))
             first += block.h.size
         for entry, radius in enumerate(self.spread.radii.tolist()):
             answering = [part for part in parts if part[0].indptr[entry] < part[0].indptr[entry + 1]]
             if radius <= 0.0 or not answering:
                 continue
-            lines = [C[[entry]] for C, _, _, _ in answering]
+            lines = [C[[entry]] for C, _, _, _, _ in answering]
             columns = np.unique(np.concatenate([line.indices for line in lines]))
             columns = columns[free[columns]]
             if not columns.size or not slope[columns].any():
                 continue
-            shares = np.array([deviations[rows[0], entry] * signs[0] for _, rows, signs, _ in answering]) / radius
-            weights = radius * np.array([total for _, _, _, total in answering])
+            shares = np.array([deviations[rows[0], entry] * signs[0] for _, _, rows, signs, _ in answering]) / radius
+            weights = radius * np.array([total for _, _, _, _, total in answering])
+            constants = weights * np.array([d[entry] for _, d, _, _, _ in answering])
             table = np.stack([line.toarray()[0][columns] for line in lines], axis=1) * weights
             room = np.maximum(1.0 - np.abs(shares), 0.0)  # what is inside of its set moves first
             change = room * np.clip(
                 np.linalg.lstsq(table * room, -slope[columns], rcond=SAME_POINT_DISTANCE)[0], -1.0, 1.0
             )
-            refined = np.clip(shares + change, -1.0, 1.0)
-            slope[columns] += table @ (refined - shares)
-            limits = np.nextafter(-1.0 - refined, -np.inf), np.nextafter(1.0 - refined, np.inf)
+            shares = self._move_shares(slope, columns, table, constants, (shares, change))
+            limits = np.nextafter(-1.0 - shares, -np.inf), np.nextafter(1.0 - shares, np.inf)
             change = lsq_linear(
                 table, -slope[columns], limits, "bvls", SAME_POINT_DISTANCE, max_iter=LEAST_SQUARES_PASSES
             ).x
-            final = np.clip(refined + change, -1.0, 1.0)
-            slope[columns] += table @ (final - refined)
-            for (_, rows, signs, _), share in zip(answering, final.tolist(), strict=True):
+            shares = self._move_shares(slope, columns, table, constants, (shares, change))
+            for (_, _, rows, signs, _), share in zip(answering, shares.tolist(), strict=True):
                 deviations[rows, entry] = signs * share * radius
+
+    def _move_shares(
+        self, slope: Array, columns: np.ndarray, table: Array, constants: Array, moved: tuple[Array, Array]
+    ) -> Array:
+        """Return shares of a deviation after a change, and correct the ``slope`` in ``columns`` in place; the shares as
+        they are where the change does not raise the bound.
+
+        ``table`` and ``constants`` are the slopes and the constant of each share, and ``moved`` has the shares and
+        their change.
+        """
+        shares, change = moved
+        changed = np.clip(shares + change, -1.0, 1.0)
+        before, after = slope[columns], slope[columns] + table @ (changed - shares)
+        gain = self._bound_variables(columns, after) - self._bound_variables(columns, before)
+        if not float(constants @ (changed - shares)) + gain > 0.0:
+            return shares
+        slope[columns] = after
+        return changed
+
+    def _bound_variables(self, columns: np.ndarray, slope: Array) -> float:
+        """Return the least value of variables in ``columns`` within their bounds, times their ``slope``."""
+        return float(np.minimum(slope * self.program.lower[columns], slope * self.program.upper[columns]).sum())
 
 
 @final

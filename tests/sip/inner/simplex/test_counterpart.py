@@ -389,3 +389,24 @@ def test_the_rounding_of_a_bound_is_counted_for_as_many_rows_as_there_are(count:
     truth = -count * Fraction(y[0]) * Fraction(g[0])
     assert Fraction(found.value - found.rounding * found.size) <= truth
     assert (Fraction(found.value - 2.0**-46 * found.size) > truth) == (count == 100_000)
+
+
+@pytest.mark.parametrize("constant", [0.0, 1e-9, -1e-9, 1e-3, -1e-3])
+def test_deviations_move_only_where_this_raises_the_bound(constant: float) -> None:
+    """Two nearly dependent rows: a slope of rounding asks for a large change, which may cost more than it gains."""
+    counterpart, columns = Counterpart(program(np.random.default_rng(1)), BOX), np.array([1, 2])
+    table, constants = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-6]]), np.array([constant, 0.0])
+    slope, shares = np.array([0.0, 1e-8, 0.0, 0.0]), np.array([0.5, -0.25])
+    change = np.linalg.solve(table, -slope[columns])
+    lower, upper = counterpart.program.lower[columns], counterpart.program.upper[columns]
+
+    def bound(slope: Array, shares: Array) -> float:
+        return float(constants @ shares + np.minimum(slope[columns] * lower, slope[columns] * upper).sum())
+
+    before, moved = bound(slope, shares), slope.copy()
+    found = counterpart._move_shares(moved, columns, table, constants, (shares, change))
+    is_better = bound(np.zeros(4), shares + change) > before
+    assert is_better == (constant * change[0] > -1e-8)  # of a change of 1e-2, and of a slope of 1e-8
+    assert bound(moved, found) == pytest.approx(max(before, bound(np.zeros(4), shares + change)), abs=1e-15)
+    assert np.array_equal(found, shares + change if is_better else shares)
+    assert np.array_equal(moved, slope) != is_better
