@@ -345,12 +345,12 @@ class NamedDeviations:
     @property
     def entering(self) -> list[list[arb]]:
         """Contribution of the deviations to the state at every breakpoint since the one before, ``(K, d)``."""
-        return self._see(self.z, self.loop.entering_effects, self.case.problem.system.states)
+        return self._see(self.loop.entering_effects, self.case.problem.system.states)
 
     @property
     def errors(self) -> list[list[arb]]:
         """Errors of the states that the control knows at every breakpoint, ``(K, d)``; 0 where these are measured."""
-        return self._see(self.z, self.loop.estimation_errors, self.case.problem.system.states)
+        return self._see(self.loop.estimation_errors, self.case.problem.system.states)
 
     @property
     def middles(self) -> NamedDeviations:
@@ -364,14 +364,13 @@ class NamedDeviations:
         pairs = zip(self.z, self.loop.deviations.rests, strict=True)
         return [[ball(0)] * len(z) if z is rest else [x - r for x, r in zip(z, rest, strict=True)] for z, rest in pairs]
 
-    @staticmethod
-    def _see(z: Sequence[Sequence[arb]], effects: Sequence[Mapping[int, arb_mat]], count: int) -> list[list[arb]]:
-        """Return the ``count`` entries at every breakpoint that deviations make block by block, with these
+    def _see(self, effects: Sequence[Mapping[int, arb_mat]], count: int) -> list[list[arb]]:
+        """Return the ``count`` entries at every breakpoint that the deviations make block by block, with these
         ``effects``."""
         return [
             [
                 sum(
-                    (response[s, b] * x for block, response in responses.items() for b, x in enumerate(z[block])),
+                    (response[s, b] * x for block, response in responses.items() for b, x in enumerate(self.z[block])),
                     ball(0),
                 )
                 for s in range(count)

@@ -84,7 +84,15 @@ def test_a_row_under_named_deviations_is_the_control_under_them(noise: bool) -> 
     constant, slopes = feedback.case.inner.on_decided(
         [[ball(s)] for s in slope], lambda: (named.entering, named.errors)
     )
-    innovations = np.array([[float(e) for e in row] for row in named.innovations])
+    innovations = np.zeros((5, named.loop.outputs))
+    for k, responses in enumerate(named.loop.innovation_matrices):
+        for block, response in responses.items():
+            parts = [
+                float(response[s, b] * x)
+                for s in range(len(innovations[k]))
+                for b, x in enumerate(named.answered[block])
+            ]
+            innovations[k] += np.reshape(parts, (len(innovations[k]), -1)).sum(axis=1)
     answered = np.einsum("kjmp,jp->km", loop.gains(x), innovations)[:, 0] + x[:5]
     found = float(constant) + sum(float(s) * u for (s,), u in zip(slopes, answered, strict=True))
     assert found == pytest.approx(float(slope @ (loop.controls(x) @ np.append(1.0, z))[:, 0]), rel=1e-9)
