@@ -66,7 +66,7 @@ def by_do_mpc(options: dict[str, Any]) -> Shot:
 
 def by_openscvx(options: dict[str, Any], iterations: int = 100) -> Shot:
     """OpenSCvx: successive convexification, walls by its penalty at all times (``ctcs``); ``|u|`` is the rate of an
-    effort. With its own weights it stops early; these are the best of six that were tried."""
+    effort. With its own weights it stops early; these are the best of those that were tried."""
     import openscvx as ox
 
     problem = options["problem"]
