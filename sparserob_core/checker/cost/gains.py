@@ -126,18 +126,21 @@ class GainsBound:
             [float(length) for block in self._list_blocks(members) for _, length in self._segments[block]]
         )
         free = _find_undetermined(middles(stacked(table)) * lengths)
+        if not free:
+            return None
         rows = [row for row in ([line[c] for c in free] for line in table) if any(not x.is_zero() for x in row)]
-        if not rows:
-            return None
-        D, size = stacked(rows), lengths[free]
-        X = exactly(size[:, None] * np.linalg.pinv(_scale_rows(middles(D) * size)))
+        shortened = zeros(len(free), len(free))  # of directions without any innovation
+        if rows:
+            D, size = stacked(rows), lengths[free]
+            X = exactly(size[:, None] * np.linalg.pinv(_scale_rows(middles(D) * size)))
+            try:
+                shortened = X * (D * X).inv() * D
+            except ZeroDivisionError:
+                return None
         projection = identity(lengths.size).tolist()
-        try:
-            for place, line in zip(free, (X * (D * X).inv() * D).tolist(), strict=True):
-                for column, x in zip(free, line, strict=True):
-                    projection[place][column] = x
-        except ZeroDivisionError:
-            return None
+        for place, line in zip(free, shortened.tolist(), strict=True):
+            for column, x in zip(free, line, strict=True):
+                projection[place][column] = x
         return stacked(projection)
 
     @cached_property

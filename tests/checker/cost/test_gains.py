@@ -115,6 +115,20 @@ def test_the_bound_is_attained_where_one_number_is_measured_of_one_block() -> No
     assert float(bound.of(rows)) == pytest.approx(most_of(matrix_of(loop, 3), q, np.full(4, 2.0), 6.0))
 
 
+def test_a_direction_that_is_not_measured_leaves_gains_nothing() -> None:
+    """Of an initial state only the first entry is measured: gains cannot answer the second one, however large."""
+    system = LinearSystem(PLANTS["one push on two states"][0], np.ones((2, 1)), np.eye(2))
+    loop = loop_of(system, GRIDS["alike"], None, Box([-1.0, -1.0], [1.0, 1.0]))
+    seen = {loop.deviations.initial_block: arb_mat([[1, 0], [0, 0]])}
+    loop.__dict__["_measured_effects"] = [seen, {}, {}, {}], [{}] * 4
+    bound = GainsBound(loop, np.tril(np.ones((4, 4), dtype=bool)), Box([-1.0], [1.0]))
+    entry = loop.deviations.starts[loop.deviations.initial_block]
+    for first, second in ((0.0, 5.0), (0.25, 5.0), (0.25, 0.0)):
+        z = [arb(0)] * entry + [arb(first), arb(second)]
+        row = ConstraintRow(arb(0), [[arb(1)]] + [[arb(0)]] * 3, deviations=[z[:entry], z[entry:]] if entry else [z])
+        assert float(bound.of([(1.0, row)])) == pytest.approx(first, abs=1e-15)
+
+
 def test_deviations_of_the_initial_state_and_of_thin_sets_are_counted_along_their_segments() -> None:
     rng, E = np.random.default_rng(7), np.eye(2)
     system = LinearSystem(PLANTS["one push on two states"][0], np.ones((2, 1)), E)
