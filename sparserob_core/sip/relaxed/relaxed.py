@@ -266,16 +266,14 @@ class RelaxedProgram:
     def _bound_row_errors(self, rows: Rows, y: Array, x: Array) -> float:
         """Return the error that rounding may cause in a lower bound where terms of rows cancel, for ``x (n,)``
         nearby."""
-        used: dict[str, list[int]] = {}
-        for i in np.flatnonzero(y > 0.0).tolist():
-            used.setdefault(rows.cuts[i].family, []).append(i)
         total, nearby = 0.0, np.where(np.isfinite(x), x, 0.0)
-        for name, positions in used.items():
-            rounding = self.program.family(name).rounding
-            if rounding is not None:
-                cuts = [rows.cuts[i] for i in positions]
-                errors = rounding(nearby, np.array([cut.index for cut in cuts]))
-                total += float(y[positions] @ errors[np.arange(len(cuts)), [cut.row for cut in cuts]])
+        for family in self.program.families:
+            if family.rounding is None:
+                continue
+            used = [i for i in np.flatnonzero(y > 0.0).tolist() if rows.cuts[i].family == family.name]
+            if used:
+                errors = family.rounding(nearby, np.array([rows.cuts[i].index for i in used]))
+                total += float(y[used] @ errors[np.arange(len(used)), [rows.cuts[i].row for i in used]])
         return total
 
     def _bound_without_multipliers(self, plain: FiniteProgram, solution: FiniteSolution) -> _Proven:
