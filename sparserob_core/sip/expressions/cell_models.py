@@ -293,6 +293,10 @@ def _raise_to_fraction(model: CellModels, power: float) -> CellModels:
     Values below 0 by rounding, `ROUNDING_BELOW_ZERO`, count as 0.
     """
     result = model.compose(lambda *domain: _power(power, *domain))
+    is_zero = ~model.coefficients.any(axis=2) & (model.remainder == 0.0)
+    if power > 0.0 and is_zero.any():  # at a point, such as an index where a root begins
+        coefficients = np.where(is_zero[..., None], 0.0, result.coefficients)
+        result = CellModels(model.space, coefficients, np.where(is_zero, 0.0, result.remainder))
     high = model.bounds()[1]
     touches = np.isinf(result.remainder) & (high > 0.0) & np.isfinite(high) & np.isfinite(model.remainder)
     if power <= 0.0 or not touches.any():

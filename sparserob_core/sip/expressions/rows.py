@@ -156,7 +156,8 @@ class ExpressionRows:
         models = [self._as_models(row.value(variables, decision, parts), space) for row in self.rows]
         values = np.stack([np.broadcast_to(model.coefficients[:, 0, 0], len(indices)) for model in models], axis=1)
         errors = np.stack([np.broadcast_to(model.remainder[:, 0], len(indices)) for model in models], axis=1)
-        return np.asarray(errors + np.abs(values - (G @ x - h)))
+        bounds = errors + np.abs(values - (G @ x - h))
+        return np.where(np.isfinite(bounds), bounds, np.inf)  # a model may have no value where the row has one
 
     def _as_models(self, value: object, space: TaylorSpace) -> CellModels:
         return value if isinstance(value, CellModels) else CellModels.constant(space, np.asarray(value, dtype=float))

@@ -11,6 +11,8 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.errors import InputError
 from sparserob_core.sip.expressions.cell_models import CellModels
+from sparserob_core.sip.expressions.rows import ExpressionRows
+from sparserob_core.sip.expressions.statements import Decisions
 from sparserob_core.sip.expressions.taylor import taylor_space
 from tests.support.stated import certify, judge, state
 
@@ -120,3 +122,9 @@ def test_a_program_with_a_root_is_certified_and_checked(name: str) -> None:
 def test_a_root_that_is_negative_within_the_index_set_is_told() -> None:
     with pytest.raises(InputError, match="no finite value"):
         sr.solve(state({"d": None}, "d", "sqrt(t - 0.25) <= d").build())
+
+
+def test_rounding_errors_of_a_root_are_bounded_where_it_begins() -> None:
+    rows = ExpressionRows.parse({"t": (0.0, 1.0)}, ["x >= sqrt(t) + t^1.5"], Decisions({"x": None}), {})
+    bounds = rows.roundings(np.array([0.5]), np.array([[0.0], [1e-12], [1e-3], [1.0]]))
+    assert (bounds >= 0.0).all() and bounds[0, 0] <= 1e-15 and bounds.max() <= 1e-14
