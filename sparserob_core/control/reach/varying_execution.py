@@ -516,7 +516,8 @@ class VaryingExecutionSupport:
         ``g`` changes its sign the slope jumps upwards only. All matrices are those at the start, and their change
         within the cell is added. The bounds are summed over the coefficients.
         """
-        motion, d, columns, rows = self.cell.motion, self.cell.motion.states, self.errors.columns, self._every
+        motion, rows = self.cell.motion, self._coefficient_rows
+        d, columns = motion.states, self.errors.columns
         pieces = np.minimum(motion.place(start), motion.origin.size - 1)
         (law, slope), third = motion.law(start, pieces), motion.third[pieces]
         A, inputs = law[:, :, :d], law[:, :, columns]
@@ -538,7 +539,8 @@ class VaryingExecutionSupport:
         """Bounds ``(r, K)`` of the error of the functionals on every piece, from the error of the transitions and from
         the terms beyond the degree."""
         errors, rows = self.errors, np.abs(self.rows)
-        rounded = product(np.abs(self._every), errors.rounded.T).reshape(len(rows), -1, len(errors.sizing)).sum(axis=1)
+        rounded = product(np.abs(self._coefficient_rows), errors.rounded.T)
+        rounded = rounded.reshape(len(rows), -1, len(errors.sizing)).sum(axis=1)
         truncation = self.cell.bound_truncation(errors.at_marks[:-1] + errors.rounded, errors.inputs)
         return np.asarray((rounded + product(rows, truncation.T)) * OUTWARD)
 
@@ -555,6 +557,6 @@ class VaryingExecutionSupport:
         return np.asarray(np.einsum("rd,kad->kra", np.abs(self.rows), bounds) * OUTWARD)
 
     @cached_property
-    def _every(self) -> Array:
+    def _coefficient_rows(self) -> Array:
         """The functionals as rows ``(r M, states)`` of every coefficient on the cell, on all coefficients."""
         return self.cell.along_cell(self.rows)

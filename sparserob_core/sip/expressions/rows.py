@@ -117,15 +117,12 @@ class ExpressionRows:
         space = taylor_space(self.dimension, DEGREES.get(self.dimension, 2))
         bounds, split = np.full(len(lower), -np.inf), (upper - lower).argmax(axis=1)
         size = max(1, MAX_NUMBERS // (space.products[0].size * (x.size + 1)))
-        decision = CellModels.constant(space, x[None])
         for start in range(0, len(lower), size):
-            part, parts = slice(start, start + size), dict[str, Value]()
+            part = slice(start, start + size)
             low, high = lower[part], upper[part]
-            variables = self._variables(space, low, high)
-            models = [self._as_models(row.value(variables, decision, parts), space) for row in self.rows]
-            coefficients = [np.broadcast_to(model.coefficients[:, 0], (len(low), space.size)) for model in models]
-            errors = [np.broadcast_to(model.remainder[:, 0], len(low)) for model in models]
-            over, steepest = bound_polynomials(space, np.concatenate(coefficients), np.concatenate(errors), 0.0)
+            coefficients, errors = self._build_models(space, x, low, high)
+            polynomials, remainders = coefficients.reshape(-1, space.size), errors.ravel()
+            over, steepest = bound_polynomials(space, polynomials, remainders, 0.0)
             over, steepest = over.reshape(-1, len(low)), steepest.reshape(-1, len(low))
             worst, cells = over.argmax(axis=0), np.arange(len(low))
             axis = steepest[worst, cells]
@@ -150,14 +147,19 @@ class ExpressionRows:
         Where the terms of a row cancel, the error is no share of what is left of them.
         """
         G, h = self.evaluate(indices)
-        space = taylor_space(self.dimension, 1)
-        variables, decision = self._variables(space, indices, indices), CellModels.constant(space, x[None])
+        coefficients, errors = self._build_models(taylor_space(self.dimension, 1), x, indices, indices)
+        bounds = errors.T + np.abs(coefficients[:, :, 0].T - (G @ x - h))
+        return np.where(np.isfinite(bounds), bounds, np.inf)  # a model may have no value where the row has one
+
+    def _build_models(self, space: TaylorSpace, x: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """Return the polynomials ``(r, k, M)`` of the violations of the rows on cells, and their remainders
+        ``(r, k)``."""
+        variables, decision = self._variables(space, lower, upper), CellModels.constant(space, x[None])
         parts: dict[str, Value] = {}
         models = [self._as_models(row.value(variables, decision, parts), space) for row in self.rows]
-        values = np.stack([np.broadcast_to(model.coefficients[:, 0, 0], len(indices)) for model in models], axis=1)
-        errors = np.stack([np.broadcast_to(model.remainder[:, 0], len(indices)) for model in models], axis=1)
-        bounds = errors + np.abs(values - (G @ x - h))
-        return np.where(np.isfinite(bounds), bounds, np.inf)  # a model may have no value where the row has one
+        coefficients = [np.broadcast_to(model.coefficients[:, 0], (len(lower), space.size)) for model in models]
+        remainders = [np.broadcast_to(model.remainder[:, 0], len(lower)) for model in models]
+        return np.stack(coefficients), np.stack(remainders)
 
     def _as_models(self, value: object, space: TaylorSpace) -> CellModels:
         return value if isinstance(value, CellModels) else CellModels.constant(space, np.asarray(value, dtype=float))

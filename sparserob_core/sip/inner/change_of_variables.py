@@ -111,9 +111,8 @@ def _divide_rows(program: FiniteProgram) -> NewVariables | None:
     reach = _reach(program)
     L, Q = _orthogonalise(program.A)
     sizes = np.abs(np.diag(L))
-    if not sizes.min(initial=np.inf) > DEPENDENT_EQUALITY_SHARE * sizes.max(
-        initial=0.0
-    ):  # some equalities say the same
+    # some equalities may say the same
+    if not sizes.min(initial=np.inf) > DEPENDENT_EQUALITY_SHARE * sizes.max(initial=0.0):
         return None
     is_uneven = bool(sizes.size) and sizes.max() > LARGE * sizes.min()
     large = int(np.count_nonzero(np.abs(program.G) @ reach > LARGE))
