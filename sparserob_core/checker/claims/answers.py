@@ -345,12 +345,12 @@ class NamedDeviations:
     @property
     def entering(self) -> list[list[arb]]:
         """Contribution of the deviations to the state at every breakpoint since the one before, ``(K, d)``."""
-        return self._see(self.loop.entering_effects, self.case.problem.system.states)
+        return self._see(self.loop.innovations.entering_effects, self.case.problem.system.states)
 
     @property
     def errors(self) -> list[list[arb]]:
         """Errors of the states that the control knows at every breakpoint, ``(K, d)``; 0 where these are measured."""
-        return self._see(self.loop.estimation_errors, self.case.problem.system.states)
+        return self._see(self.loop.innovations.errors, self.case.problem.system.states)
 
     @property
     def middles(self) -> NamedDeviations:
@@ -405,7 +405,7 @@ def _read_deviations(case: Case, loop: VerifiedLoop, entry: Mapping[str, Any], n
     if case.problem.disturbance is not None:
         points = list(shaped(entry, "disturbance", (loop_deviations.width, loop_deviations.blocks), f"{name}: ").T)
     if noises and loop.measured is not None:
-        points += list(shaped(entry, "noise", (noises, loop.outputs), f"{name}: "))
+        points += list(shaped(entry, "noise", (noises, loop.innovations.outputs), f"{name}: "))
     if case.problem.initial_set is not None:
         points.append(shaped(entry, "deviation", (case.problem.system.states,), f"{name}: "))
     deviations = list[list[arb]]()

@@ -80,7 +80,7 @@ class GainsBound:
 
     def _list_blocks(self, members: tuple[int, ...]) -> list[int]:
         """Return the blocks that may deviate and are measured at some breakpoints."""
-        measured = {block for j in members for block in self.loop.innovation_matrices[j]}
+        measured = {block for j in members for block in self.loop.innovations.matrices[j]}
         return sorted(block for block in measured if self._segments[block])
 
     def _measure(self, members: tuple[int, ...], deviations: Sequence[arb]) -> arb:
@@ -115,9 +115,9 @@ class GainsBound:
         table = list[list[arb]]()
         for j in members:
             parts = [
-                self.loop.innovation_matrices[j][block] * self._vectors[block]
-                if block in self.loop.innovation_matrices[j]
-                else zeros(self.loop.outputs, self._vectors[block].ncols())
+                self.loop.innovations.matrices[j][block] * self._vectors[block]
+                if block in self.loop.innovations.matrices[j]
+                else zeros(self.loop.innovations.outputs, self._vectors[block].ncols())
                 for block in self._list_blocks(members)
             ]
             rows = [[x for line in lines for x in line] for lines in zip(*map(arb_mat.tolist, parts), strict=True)]

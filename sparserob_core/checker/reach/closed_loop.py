@@ -1,15 +1,10 @@
 """A closed loop in ball arithmetic, computed from the gains alone: the control answers what it measures.
 
-The control on piece ``k`` is ``u_k = v_k + sum_j M_kj e_j``. The innovation ``e_j`` is the difference between the state
-at the breakpoint ``tau_j`` and its prediction from the state at ``tau_{j-1}``, the control in between and the middle of
-the disturbance. With ``w = m + z`` for the middle ``m``, it is ``e_j = sum_l D_jl z_l`` over the blocks ``l`` on which
-the disturbance is constant. Where the initial states are a set, ``e_0`` is the initial deviation from the middle of
-that set: the last block.
+The control on piece ``k`` is ``u_k = v_k + sum_j M_kj e_j``, with the innovations ``e_j`` of the module `innovations`.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -25,6 +20,7 @@ from sparserob_core.checker.arithmetic.series import around, exactly, identity, 
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.reach.deviations import Deviations
+from sparserob_core.checker.reach.innovations import VerifiedInnovations, find_piece
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
@@ -98,114 +94,23 @@ class VerifiedLoop:
         width, noises = self.system.disturbances, 0 if noise is None else K
         return Deviations(self.shape, width, self.initial, len(self.changes), noise, noises)
 
-    @property
-    def outputs(self) -> int:
-        """The number of entries of an innovation."""
-        return int(self.system.states) if self.measured is None else self.measured.outputs
+    @cached_property
+    def innovations(self) -> VerifiedInnovations:
+        """The innovations that the control measures at its breakpoints."""
+        return VerifiedInnovations(
+            self.flow, self.deviations, self.grid, self.breakpoints, self.changes, self.measured, self.observer
+        )
 
     def _find_acting_indices(self, piece: int) -> tuple[int, int]:
         """Return the indices of the piece of the control and of the block of the disturbance that act on a piece of the
         grid. The piece of the control is -1 before the delay is over."""
-        inside = (self.grid[piece] + self.grid[piece + 1]) / 2
-        return bisect_right(self.acting, inside) - 1, bisect_right(self.changes, inside) - 1
+        return find_piece(self.acting, self.grid, piece), find_piece(self.changes, self.grid, piece)
 
     def _compute_part_flow(self, piece: int, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
         """Return the transition ``(d, d)`` of a part of a piece of the grid, and what the inputs add to the nominal
         state and to the responses, ``(d, 1 + Q)``."""
         Phi, Gamma, Delta = self.flow.over(start, stop)
         return Phi.matrix, Gamma.append_columns(Delta).matrix * self.drives[piece]
-
-    def _compute_piece_flow(self, piece: int) -> tuple[arb_mat, arb_mat]:
-        """Return the transition ``(d, d)`` of a piece of the grid, and the effect ``(d, mw)`` of a disturbance that is
-        constant on it."""
-        Phi, _, Delta = self.flow.over(self.grid[piece], self.grid[piece + 1])
-        return Phi.matrix, Delta.matrix
-
-    @property
-    def innovation_matrices(self) -> list[dict[int, arb_mat]]:
-        """The matrices ``D_jl (p, mw)`` of every innovation ``j``, by block ``l``; blocks without effect are absent."""
-        return self._measured_effects[0]
-
-    @property
-    def estimation_errors(self) -> list[dict[int, arb_mat]]:
-        """The matrices ``(d, mw)`` from every block to the error of the state that the control knows at a breakpoint;
-        none where the state is measured."""
-        return self._measured_effects[1]
-
-    @cached_property
-    def _measured_effects(self) -> tuple[list[dict[int, arb_mat]], list[dict[int, arb_mat]]]:
-        """The `innovation_matrices` and the `estimation_errors`."""
-        if self.measured is None:
-            return self.entering_effects, [{} for _ in self.entering_effects]
-        return self._compute_observer_effects(self.measured)
-
-    def _compute_observer_effects(
-        self, measured: Measurements
-    ) -> tuple[list[dict[int, arb_mat]], list[dict[int, arb_mat]]]:
-        """Return ``D_jl`` of the innovations of the observer, and the errors of its estimates. Its error is propagated
-        from breakpoint to breakpoint, less its correction."""
-        assert self.observer is not None
-        C = exactly(np.asarray(measured.C))
-        unit, noise = identity(self.outputs), self.deviations.initial_block > self.deviations.blocks
-        is_known = measured.known(np.array(self.breakpoints))
-        innovations: list[dict[int, arb_mat]] = []
-        errors: list[dict[int, arb_mat]] = []
-        error: dict[int, arb_mat] = {}
-        for j, entering in enumerate(self.entering_effects):
-            error = _add_blocks(error, entering)
-            late = self._add_late_innovations(innovations, np.flatnonzero(~is_known[j, :j]).tolist())
-            errors.append(_add_blocks(error, late))
-            innovation = {block: C * effect for block, effect in error.items()}
-            if noise:
-                innovation[self.deviations.blocks + j] = unit
-            innovations.append(innovation)
-            if j + 1 == len(self.breakpoints) - 1:
-                break
-            # one transition of the error, since signs that are lost in balls are not found again
-            L = exactly(self.observer[j])
-            transition = self._breakpoint_transitions[j] - L * C
-            error = {block: transition * effect for block, effect in error.items()}
-            if noise:
-                error[self.deviations.blocks + j] = -L
-        return innovations, errors
-
-    def _add_late_innovations(self, innovations: list[dict[int, arb_mat]], late: list[int]) -> dict[int, arb_mat]:
-        """Return what the innovations at the breakpoints ``late``, the last ones so far, add to the prediction of the
-        state, ``(d, mw)`` by block."""
-        assert self.observer is not None
-        added: dict[int, arb_mat] = {}
-        for j in late:
-            L, flow = exactly(self.observer[j]), self._breakpoint_transitions[j]
-            added = {block: flow * effect for block, effect in added.items()}
-            added = _add_blocks(added, {block: L * effect for block, effect in innovations[j].items()})
-        return added
-
-    @cached_property
-    def _breakpoint_transitions(self) -> list[arb_mat]:
-        """The transitions from each breakpoint of the control to the next, ``(d, d)`` each."""
-        transitions = [identity(self.system.states) for _ in self.breakpoints[:-1]]
-        for piece in range(len(self.grid) - 1):
-            transitions[self.on(piece)] = self._compute_piece_flow(piece)[0] * transitions[self.on(piece)]
-        return transitions
-
-    @cached_property
-    def entering_effects(self) -> list[dict[int, arb_mat]]:
-        """The effect ``(d, mw)`` of every block on the state at a breakpoint of the control, as far as it entered since
-        the breakpoint before; at the first breakpoint, the initial deviation."""
-        K = len(self.breakpoints) - 1
-        effects: list[dict[int, arb_mat]] = [{} for _ in range(K)]
-        if self.initial is not None:
-            effects[0][self.deviations.initial_block] = identity(self.system.states)
-        for piece in range(len(self.grid) - 1 if self.deviations.blocks else 0):
-            k, (_, block) = self.on(piece), self._find_acting_indices(piece)
-            if k + 1 >= K:
-                break
-            Phi, effect = self._compute_piece_flow(piece)
-            by_block = {earlier: Phi * before for earlier, before in effects[k + 1].items()}
-            if any(not x.is_zero() for x in effect.entries()):
-                by_block[block] = by_block[block] + effect if block in by_block else effect
-            effects[k + 1] = by_block
-        return effects
 
     @cached_property
     def effects(self) -> list[list[list[arb]]]:
@@ -288,9 +193,9 @@ class VerifiedLoop:
         rows = [[v, *[zero] * starts[-1]] for v in self.nominal[k].entries()]
         for j in np.flatnonzero(self.gains[k].any(axis=(1, 2))).tolist():
             M = exactly(self.gains[k, j])
-            for block, matrix in self.innovation_matrices[j].items():
+            for block, matrix in self.innovations.matrices[j].items():
                 self._add_response(rows, block, M * matrix)
-        for block, matrix in self.estimation_errors[k].items() if self.inner.size else ():
+        for block, matrix in self.innovations.errors[k].items() if self.inner.size else ():
             self._add_response(rows, block, -exactly(self.inner[k]) * matrix)
         return stacked(rows)
 
@@ -304,7 +209,7 @@ class VerifiedLoop:
         """Return upper bounds ``(m,)`` of what feedbacks ``gains (K, m, d)`` of the state at the breakpoints do not
         know of it, under any deviation; 0 where the state is measured."""
         largest = np.zeros(gains.shape[1])
-        for gain, errors in zip(gains, self.estimation_errors, strict=True):
+        for gain, errors in zip(gains, self.innovations.errors, strict=True):
             rows = [[ball(0.0)] * (1 + self.deviations.starts[-1]) for _ in largest]
             for block, matrix in errors.items():
                 self._add_response(rows, block, exactly(gain) * matrix)
@@ -319,7 +224,7 @@ class VerifiedLoop:
     def on(self, piece: int) -> int:
         """Return the index of the piece of the control that is commanded on a piece of the grid. Without a delay, this
         piece acts there."""
-        return bisect_right(self.breakpoints, (self.grid[piece] + self.grid[piece + 1]) / 2) - 1
+        return find_piece(self.breakpoints, self.grid, piece)
 
     def heights(self, state: arb_mat, rows: Array | arb_mat, added_terms: arb_mat | None = None) -> list[arb]:
         """Return the largest ``c'x`` over all deviations, for every row ``c`` of ``rows (r, d)``, from a nominal
@@ -348,11 +253,3 @@ class VerifiedLoop:
         enclosure = Enclosed.of(line * (around(remainder) * augmented))
         total += 2.0 * (np.abs(enclosure.mid) + enclosure.rad)
         return np.asarray(total @ sizes * (1.0 + rounding(sizes.size)) * OUTWARD)
-
-
-def _add_blocks(effects: dict[int, arb_mat], added: dict[int, arb_mat]) -> dict[int, arb_mat]:
-    """Return the sums of two effects, block by block."""
-    return {
-        **effects,
-        **{block: effects[block] + effect if block in effects else effect for block, effect in added.items()},
-    }

@@ -53,10 +53,10 @@ def loop_of(system, changes, shape, initial=None):
 
 def matrix_of(loop, k):
     """The floats ``D (k d, blocks mw)`` from all deviations to what the control on piece ``k`` may answer."""
-    d, starts = loop.outputs, loop.deviations.starts
+    d, starts = loop.innovations.outputs, loop.deviations.starts
     D = np.zeros(((k + 1) * d, starts[-1]))
     for j in range(k + 1):
-        for block, part in loop.innovation_matrices[j].items():
+        for block, part in loop.innovations.matrices[j].items():
             D[j * d : (j + 1) * d, starts[block] : starts[block + 1]] = [[float(x) for x in r] for r in part.tolist()]
     return D
 
@@ -120,7 +120,7 @@ def test_a_direction_that_is_not_measured_leaves_gains_nothing() -> None:
     system = LinearSystem(PLANTS["one push on two states"][0], np.ones((2, 1)), np.eye(2))
     loop = loop_of(system, GRIDS["alike"], None, Box([-1.0, -1.0], [1.0, 1.0]))
     seen = {loop.deviations.initial_block: arb_mat([[1, 0], [0, 0]])}
-    loop.__dict__["_measured_effects"] = [seen, {}, {}, {}], [{}] * 4
+    loop.innovations.__dict__["_effects"] = [seen, {}, {}, {}], [{}] * 4
     bound = GainsBound(loop, np.tril(np.ones((4, 4), dtype=bool)), Box([-1.0], [1.0]))
     entry = loop.deviations.starts[loop.deviations.initial_block]
     for first, second in ((0.0, 5.0), (0.25, 5.0), (0.25, 0.0)):

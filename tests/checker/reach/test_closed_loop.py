@@ -245,7 +245,7 @@ def test_an_innovation_adds_up_what_a_disturbance_did_on_every_part_of_its_piece
                 Box([-1.0], [1.0]),
                 None,
             )
-            found = [{b: float(push[0, 0].mid()) for b, push in one.items()} for one in loop.innovation_matrices]
+            found = [{b: float(push[0, 0].mid()) for b, push in one.items()} for one in loop.innovations.matrices]
             assert found == seen
 
 

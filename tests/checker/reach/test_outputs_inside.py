@@ -84,8 +84,8 @@ def test_a_row_under_named_deviations_is_the_control_under_them(noise: bool) -> 
     constant, slopes = feedback.case.inner.on_decided(
         [[ball(s)] for s in slope], lambda: (named.entering, named.errors)
     )
-    innovations = np.zeros((5, named.loop.outputs))
-    for k, responses in enumerate(named.loop.innovation_matrices):
+    innovations = np.zeros((5, named.loop.innovations.outputs))
+    for k, responses in enumerate(named.loop.innovations.matrices):
         for block, response in responses.items():
             parts = [
                 float(response[s, b] * x)
