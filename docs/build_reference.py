@@ -16,7 +16,8 @@ from sparserob_core.experiment.config.extending import MEANING as MEANS
 from sparserob_core.experiment.config.option_rows import option_rows
 from sparserob_core.experiment.config.run_config import RunConfig
 from sparserob_core.experiment.config.schema import config_schema
-from sparserob_core.experiment.plugins.hookspecs import HOOKS
+from sparserob_core.experiment.plugins.commands import COMMANDS
+from sparserob_core.experiment.plugins.hookspecs import HOOKS, CommandPlugin
 from sparserob_core.experiment.terminal.printing import EXIT
 from sparserob_core.options import meanings
 
@@ -112,7 +113,8 @@ def table(columns: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
 
 def _commands() -> list[str]:
     lines = ["## Commands", ""]
-    for name, command in commands.commands.items():
+    for name in COMMANDS:
+        command = commands.get_command(click.Context(commands), name)
         context = click.Context(command, info_name=f"sparserob {name}")
         usage = [
             parameter.make_metavar(context) for parameter in command.params if isinstance(parameter, click.Argument)
@@ -156,6 +158,8 @@ def _config() -> list[str]:
 def _components() -> list[str]:
     lines = ["## Components"]
     for record in sr.load_registry().records():
+        if record.kind == CommandPlugin.kind:  # they have a section
+            continue
         rows = [
             (f"`{row.name}`", row.type, row.default and f"`{row.default}`", row.range, row.meaning)
             for row in option_rows(record, ask=False)

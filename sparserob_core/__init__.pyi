@@ -89,6 +89,7 @@ from sparserob_core.errors import not_installed as not_installed
 
 # To write a component, and to register it.
 from sparserob_core.options import Options as Options
+from sparserob_core.experiment.plugins.hookspecs import CommandPlugin as CommandPlugin
 from sparserob_core.experiment.plugins.hookspecs import DictionaryPlugin as DictionaryPlugin
 from sparserob_core.experiment.plugins.hookspecs import ExecutorPlugin as ExecutorPlugin
 from sparserob_core.experiment.plugins.hookspecs import MaximiserPlugin as MaximiserPlugin

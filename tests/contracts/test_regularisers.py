@@ -1,4 +1,4 @@
-"""Guards sparserob_core/testing/regularisers and every registered regulariser: each keeps the contract, and
+"""Guards sparserob_core/testing/dictionaries and every registered regulariser: each keeps the contract, and
 regularisers that are wrong on purpose fail it."""
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ import sparserob_core.testing as contracts
 from sparserob_core.experiment.plugins.records import RECORDS
 from sparserob_core.experiment.scaffold.new_plugin import kinds
 from tests.contracts import (
+    test_commands,
     test_dictionaries,
     test_executors,
     test_maximisers,
@@ -37,6 +38,11 @@ def loud(honest, method):
         return getattr(honest, method)(self, *arguments)
 
     return type("Loud", (honest,), {method: printing})
+
+
+def loud_command():
+    print("here I am")
+    return test_commands.honest()
 
 
 class LoudPolicy(test_policies.Measured):
@@ -85,6 +91,7 @@ PRINTING = {
     "inner_stop": (loud(Stale, "__call__"), test_rules.ANSWER),
     "selection": (loud(Metropolis, "__call__"), test_rules.ODD),
     "executor": (loud(test_executors.Bad, "open"), test_executors.ORDER),
+    "command": (loud_command, test_commands.HELP),
     "observer": (loud(test_observers.Counting, "receive"), "test_a_study_is_watched_or_ignored"),
 }
 FAULTS = {
@@ -101,6 +108,7 @@ FAULTS = {
     "inner_stop": test_rules.INNER_STOPS,
     "selection": test_rules.SELECTIONS,
     "executor": test_executors.FAULTS,
+    "command": test_commands.FAULTS,
     "observer": test_observers.FAULTS,
 }
 """What the tests beside this one put before each contract, with the test that has to fail."""

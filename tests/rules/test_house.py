@@ -36,7 +36,10 @@ AT_HOME = {
 """Folders whose modules may import a heavy package at their top, where nothing that is to begin at once loads them:
 fresh interpreters are asked below, and in tests/experiment/cli."""
 A_DOZEN = 12
-PLACES = ("sparserob_core/experiment/cli/", "sparserob_core/experiment/terminal/")
+PLACES = (
+    *("sparserob_core/experiment/cli/", "sparserob_core/experiment/terminal/"),
+    *("sparserob_core/experiment/plugins/hookspecs.py", "sparserob_core/testing/commands.py"),  # commands of plugins
+)
 
 
 def relative(path: Path) -> str:

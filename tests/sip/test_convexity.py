@@ -235,7 +235,7 @@ def test_no_regulariser_that_is_not_convex_is_used(name):
 
 
 def test_every_shipped_regulariser_passes():
-    from sparserob_core.testing.regularisers import images
+    from sparserob_core.testing.dictionaries import images
 
     registry = sr.load_registry()
     for name in registry.names("regulariser"):

@@ -7,28 +7,15 @@ import gc
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from copy import copy
 from functools import wraps
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from sparserob_core.errors import SparseRobError, named
-from sparserob_core.experiment.cli.catalogue.examples import examples
-from sparserob_core.experiment.cli.catalogue.plugins import new_plugin, plugins
-from sparserob_core.experiment.cli.catalogue.schema import schema
-from sparserob_core.experiment.cli.commands.bound import bound
-from sparserob_core.experiment.cli.commands.check import check
-from sparserob_core.experiment.cli.commands.compare import benchmark, compare
-from sparserob_core.experiment.cli.commands.figures import figures
-from sparserob_core.experiment.cli.commands.initial_states import initial_states
-from sparserob_core.experiment.cli.commands.loop import loop
-from sparserob_core.experiment.cli.commands.margin import margin
-from sparserob_core.experiment.cli.commands.replay import replay
-from sparserob_core.experiment.cli.commands.run import run
-from sparserob_core.experiment.cli.commands.simulate import simulate
-from sparserob_core.experiment.cli.commands.sweep import sweep
-from sparserob_core.experiment.cli.commands.watch import watch
+from sparserob_core.errors import PluginError, SparseRobError, UnknownPluginError, named
 from sparserob_core.experiment.cli.shell.process import (
     INTERRUPTED,
     OutputError,
@@ -38,11 +25,18 @@ from sparserob_core.experiment.cli.shell.process import (
     open_streams,
     spare_imports,
 )
+from sparserob_core.experiment.plugins.commands import COMMANDS
 from sparserob_core.experiment.terminal.printing import own_output, printable
+
+if TYPE_CHECKING:
+    from sparserob_core.experiment.plugins.hookspecs import CommandPlugin
 
 DEBUG = "SPARSEROB_DEBUG"
 # Allocations between two searches for cycles: at first nearly all are of modules, which stay.
 RARELY = (200_000, 20, 20)
+MAX_STATUS = 255  # of a process
+# errors of a command that have a message of their own
+PASSING = (SparseRobError, click.ClickException, click.exceptions.Exit, click.Abort, OSError, MemoryError)
 QUESTIONS = frozenset({"-h", "--help", "--version"})  # that need no numbers
 
 
@@ -110,14 +104,33 @@ def _report_error(message: str, error: BaseException, status: int) -> int:
 
 
 class Commands(click.Group):
-    """The group of all commands. A reader that has stopped reading is met here, before click would end with 1; what
-    components print while a command runs goes to the standard error stream."""
+    """The commands of the core, and those of plugins, which are searched where the core has none of that name.
 
-    def add_command(self, cmd: click.Command, name: str | None = None) -> None:
-        """Add a command, whose output is its own."""
-        if cmd.callback is not None:
-            cmd.callback = _with_own_output(cmd.callback)
-        super().add_command(cmd, name)
+    A reader that has stopped reading is met here, before click would end with 1. What components print while a command
+    of the core runs goes to the standard error stream.
+    """
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of all commands, as they are typed, sorted."""
+        return sorted({*COMMANDS, *_list_foreign()[0]})
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return the command of a name; ``None`` where there is none."""
+        if cmd_name in COMMANDS:
+            return _load_own(COMMANDS[cmd_name][0])
+        records, notes = _list_foreign()
+        if cmd_name in records:
+            return _load_foreign(records[cmd_name])
+        if notes:
+            raise UnknownPluginError(f"no such command '{cmd_name}'{notes}")
+        return None
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write every command with its summary; none of them is loaded."""
+        summaries = {name: summary for name, (_, summary) in COMMANDS.items()}
+        summaries |= {name: record.summary for name, record in _list_foreign()[0].items()}
+        with formatter.section("Commands"):
+            formatter.write_dl(sorted(summaries.items()))
 
     def invoke(self, ctx: click.Context) -> Any:
         """The command's exit status."""
@@ -128,38 +141,52 @@ class Commands(click.Group):
             return 0
 
 
-def _with_own_output(command: Callable[..., Any]) -> Callable[..., Any]:
-    @wraps(command)
+def _list_foreign() -> tuple[dict[str, CommandPlugin], str]:
+    """Return the records of the commands of installed plugins, by the names that are typed, and why one may be
+    missing."""
+    from sparserob_core.experiment.plugins.registry import load_registry
+
+    registry = load_registry()
+    records = (cast("CommandPlugin", record) for record in registry.records() if record.kind == "command")
+    return {name: r for r in records if (name := r.name.replace("_", "-")) not in COMMANDS}, registry.notes()
+
+
+def _load_own(place: str) -> click.Command:
+    """Return a command of the core, whose output is its own."""
+    module, _, attribute = place.partition(":")
+    command = copy(getattr(import_module(module), attribute))
+    callback = command.callback
+
+    @wraps(callback)
     def called(*arguments: Any, **options: Any) -> Any:
         with own_output():
-            return command(*arguments, **options)
+            return callback(*arguments, **options)
 
-    return called
+    command.callback = called
+    return command  # type: ignore[no-any-return]
+
+
+def _load_foreign(record: CommandPlugin) -> click.Command:
+    """Return the command of a plugin, whose errors name the plugin, and whose result must be an exit status."""
+    from sparserob_core.experiment.plugins.attribution import attributed, short_repr
+    from sparserob_core.options import Options
+
+    command = copy(record.create(Options()))
+    invoke = command.invoke
+
+    def invoked(ctx: click.Context) -> int:
+        with attributed(record.origin, "running it", PASSING):
+            status = invoke(ctx)
+        if status is not None and (type(status) is not int or not 0 <= status <= MAX_STATUS):
+            expected = f"expected an exit status, 0 to {MAX_STATUS}, or nothing"
+            raise PluginError(f"{record.origin}: running it returned {short_repr(status)}, {expected}")
+        return status or 0
+
+    command.invoke = invoked  # type: ignore[method-assign]
+    return command
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="sparserob", message="%(prog)s %(version)s")
 def commands() -> None:
     """Sparse robust optimal control of uncertain linear systems, with the proof."""
-
-
-for command in (
-    run,
-    sweep,
-    watch,
-    replay,
-    check,
-    simulate,
-    loop,
-    margin,
-    bound,
-    initial_states,
-    compare,
-    benchmark,
-    figures,
-    plugins,
-    new_plugin,
-    examples,
-    schema,
-):
-    commands.add_command(command)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from sparserob_core.experiment.plugins.commands import COMMANDS
 from sparserob_core.experiment.plugins.hookspecs import (
+    CommandPlugin,
     MethodPlugin,
     ProblemPlugin,
     RulePlugin,
@@ -122,3 +124,10 @@ def sparserob_problems() -> Iterator[ProblemPlugin]:
         regularised=False,
         summary="A convex semi-infinite program as text: decisions, an objective, and rows for every index.",
     )
+
+
+@hookimpl
+def sparserob_commands() -> Iterator[CommandPlugin]:
+    """Yield the commands of the core."""
+    for name, (place, summary) in COMMANDS.items():
+        yield CommandPlugin(name=name.replace("-", "_"), factory=place, summary=summary)

@@ -9,10 +9,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TypeVar, final
 
+import click
 import pluggy
 
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.plugins.attribution import asked
 from sparserob_core.experiment.plugins.records import RECORDS, Plugin
+from sparserob_core.options import Options
 
 GROUP = "sparserob"
 
@@ -92,6 +95,24 @@ class ExecutorPlugin(Plugin, hook="sparserob_executors", component="sparserob_co
 @final
 class ObserverPlugin(Plugin, hook="sparserob_observers", component="sparserob_core.experiment.run.events:Observer"):
     """An `Observer`, which receives every event of a run or of a study."""
+
+
+@final
+class CommandPlugin(Plugin, hook="sparserob_commands", component="click:Command"):
+    """A `click.Command` of the program ``sparserob``: the ``factory`` is the command itself, or its place.
+
+    Users type an underscore of the name as a hyphen. The ``summary`` is its line in ``sparserob --help``.
+    """
+
+    @property
+    def usage(self) -> str:
+        """The help of the command."""
+        command = self.create(Options())
+        return command.get_help(click.Context(command, info_name=f"sparserob {self.name.replace('_', '-')}"))
+
+    def create(self, options: Options) -> click.Command:
+        """Return the command; it has arguments of its own and no ``options``."""
+        return asked(self.origin, "loading it", self.resolved, click.Command)
 
 
 Function = TypeVar("Function", bound=Callable[..., Iterable[Plugin]])

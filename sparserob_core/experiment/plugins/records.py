@@ -117,6 +117,11 @@ class Plugin:
         return f"{self.kind} '{self.name}'"
 
     @property
+    def usage(self) -> str:
+        """The help of a component that users call beside a config; else empty."""
+        return ""
+
+    @property
     def origin(self) -> str:
         """The component with its kind and its source, for messages."""
         source = f", {self.source}" if self.source else ""

@@ -46,6 +46,7 @@ def new_plugin(kind: str, name: str, out: str | Path = ".") -> Path:
         raise InputError(path="out", expected="a folder in which the package is not yet", got=f"one with {folder}")
     words = {
         "name": name,
+        "typed": name.replace("_", "-"),
         "package": package,
         "distribution": package.replace("_", "-"),
         "kind": chosen.replace("_", " "),

@@ -51,6 +51,9 @@ def _describe_component(registry: Registry, name: str) -> int:
     from sparserob_core.experiment.terminal.table import print_table
 
     for record in registry.find(name):
+        if record.usage:
+            say(record.usage)
+            continue
         rows = [(row.name, row.type, row.default, row.range, row.meaning) for row in option_rows(record)]
         title = f"{record.kind} {record.name} (plugin {record.plugin}, {record.distribution}): {record.summary}"
         print_table(
@@ -77,8 +80,8 @@ def new_plugin(kind: str, name: str, out: str) -> int:
     It is typed, documented and installable, and has the tests that every component of its kind has to pass. Nothing is
     overwritten.
 
-    KIND is one of: problem, set, policy, method, dictionary, regulariser, solver, maximiser, executor, observer, or of
-    the rules of the paper's loop: schedule, outer-stop, inner-stop, selection.
+    KIND is one of: problem, set, policy, method, dictionary, regulariser, solver, maximiser, executor, observer,
+    command, or of the rules of the paper's loop: schedule, outer-stop, inner-stop, selection.
     """
     from sparserob_core.experiment.scaffold.new_plugin import new_plugin as write
 
