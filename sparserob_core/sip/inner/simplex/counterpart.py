@@ -505,7 +505,9 @@ class Counterpart:
 
     def _bound_variables(self, columns: np.ndarray, slope: Array) -> float:
         """Return the least value of variables in ``columns`` within their bounds, times their ``slope``."""
-        return float(np.minimum(slope * self.program.lower[columns], slope * self.program.upper[columns]).sum())
+        bounds = np.where(slope > 0.0, self.program.lower[columns], self.program.upper[columns])
+        is_sloped = slope != 0.0  # what has no slope adds nothing, also where it has no bound
+        return float(slope[is_sloped] @ bounds[is_sloped])
 
 
 @final

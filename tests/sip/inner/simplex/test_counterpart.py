@@ -18,7 +18,7 @@ from sparserob_core.sip.finite import Blocks, FiniteProgram, Spread, UncertainRo
 from sparserob_core.sip.inner.simplex import counterpart as simplex
 from sparserob_core.sip.inner.simplex.counterpart import Counterpart, Growing, RobustAnswer, robust_bound
 
-N, Q = 4, 3
+N, Q, EMPTY = 4, 3, np.zeros(0)
 BOX = Spread(((1, Box(np.array([-0.5, -1.0]), np.array([0.5, 1.0]))), (1, Box(np.array([-0.25]), np.array([0.25])))))
 POINTED = Spread(((1, NormBall(p=1.0, radius=0.75, dimension=2)), (1, Box(np.array([0.5]), np.array([2.0])))))
 SPREADS = {"box": BOX, "pointed": POINTED}
@@ -410,3 +410,15 @@ def test_deviations_move_only_where_this_raises_the_bound(constant: float) -> No
     assert bound(moved, found) == pytest.approx(max(before, bound(np.zeros(4), shares + change)), abs=1e-15)
     assert np.array_equal(found, shares + change if is_better else shares)
     assert np.array_equal(moved, slope) != is_better
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_variable_without_an_end_adds_nothing_where_no_slope_is_left() -> None:
+    none = np.zeros((0, 2))
+    free = FiniteProgram(
+        np.zeros(2), np.zeros(2), np.array([-np.inf, -2.0]), np.array([np.inf, 3.0]), none, EMPTY, none, EMPTY
+    )
+    counterpart, columns = Counterpart(free, BOX), np.array([0, 1])
+    assert counterpart._bound_variables(columns, np.array([0.0, 1.5])) == -3.0
+    assert counterpart._bound_variables(columns, np.array([0.0, -1.5])) == -4.5
+    assert counterpart._bound_variables(columns, np.array([1e-300, 1.5])) == -np.inf
