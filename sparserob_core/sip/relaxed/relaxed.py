@@ -268,9 +268,9 @@ class RelaxedProgram:
     def _bound_row_errors(self, rows: Rows, y: Array, x: Array) -> Array:
         """Return the errors ``(r,)`` that rounding may cause in the rows with a multiplier, where their terms cancel.
 
-        A lower bound speaks of an optimum, which may be far from the answer ``x (n,)``: an entry that is 0 in the answer
-        may be at its bound there, and its coefficient may be nothing but rounding. So the errors are those of every
-        decision within its bounds.
+        A lower bound speaks of an optimum, which may be far from the answer ``x (n,)``. An entry that is 0 in the
+        answer may be at its bound there, and its coefficient may be nothing but rounding. So the errors are those of
+        every decision within its bounds.
         """
         errors, first, reach = np.zeros(y.size), y.size - rows.h.size, self._bound_decision(x)
         for family in self.program.families:

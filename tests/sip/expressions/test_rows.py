@@ -200,5 +200,7 @@ def test_rounding_errors_of_rows_are_bounded_where_their_terms_cancel() -> None:
 
 def test_rounding_errors_of_rows_are_those_of_the_largest_decision() -> None:
     rows = ExpressionRows.parse({"t": (0.0, 2.0)}, ["x[0] + x[1]*((1e16 + t) - 1e16) <= t"], Decisions({"x": 2}), {})
-    bounds = [rows.roundings(np.array(reach), np.array([[1.0]]))[0, 0] for reach in ([1.0, 0.0], [1.0, 1.0], [1.0, 3.0])]
+    bounds = [
+        rows.roundings(np.array(reach), np.array([[1.0]]))[0, 0] for reach in ([1.0, 0.0], [1.0, 1.0], [1.0, 3.0])
+    ]
     assert bounds[0] < 1e-14 and 1.0 <= bounds[1] <= 4.0 and bounds[2] == pytest.approx(3.0 * bounds[1])

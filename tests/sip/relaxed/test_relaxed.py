@@ -254,7 +254,7 @@ def test_a_lower_bound_counts_the_rounding_of_terms_that_cancel(power: float) ->
 
 
 def test_a_lower_bound_counts_the_rounding_of_entries_that_are_0_in_the_answer() -> None:
-    """The coefficient of ``a`` is 1, and its terms cancel to 0 in doubles: ``a`` looks worthless, and is the optimum."""
+    """The coefficient of ``a`` is 1. Its terms cancel to 0 in doubles, so that ``a`` looks worthless."""
     family = sr.ConstraintFamily.from_expressions(
         "f", index={"t": (1, 1)}, rows=["r + a*((1e16 + t) - 1e16) >= 1"], decision={"r": None, "a": None}
     )
