@@ -138,14 +138,14 @@ class ClosedLoop:
     def respond(self, x: Array, innovations: Sequence[Array]) -> Array:
         """Return what is added to the nominal control on every piece, ``(m, K)``, by the ``innovations (d,)`` that were
         measured so far, if nothing more happens than that."""
-        gains, known = self.gains(x), np.array(innovations)
-        answered = np.einsum("kjmd,jd->km", gains[:, : len(known)], known)
+        gains, measured = self.gains(x), np.array(innovations)
+        answered = np.einsum("kjmd,jd->km", gains[:, : len(measured)], measured)
         if not self.inner.acts:
             return np.asarray(answered.T)
         response, none = self.functionals.response, np.zeros(self.functionals.response.system.disturbances)
         plant, state = SampledPlant.of(response, self.functionals.dictionary, none, none), np.zeros(self.start.size)
         for k, (Phi, Gamma) in enumerate(zip(plant.Phi, plant.Gamma, strict=True)):
-            state = state + known[k] if k < len(known) else state
+            state = state + measured[k] if k < len(measured) else state
             answered[k] += self.inner.gains[k] @ state
             state = Phi @ state + Gamma @ answered[k]
         return np.asarray(answered.T)

@@ -160,7 +160,7 @@ class Polytope(ConvexSet):
         if rows == 0:
             return np.zeros(d), np.inf
         is_near = h <= _FAR
-        H, h, beyond = H[is_near], h[is_near], (H[~is_near], h[~is_near])
+        H, h, distant = H[is_near], h[is_near], (H[~is_near], h[~is_near])
         cap = 1.0 + float(np.abs(h).max(initial=0.0))
         norms = np.linalg.norm(H, axis=1)
         answer = linprog(
@@ -169,7 +169,7 @@ class Polytope(ConvexSet):
             h,
             bounds=[(None, None)] * d + [(None, cap)],
         )
-        if answer.status != 0 or (beyond[0] @ answer.x[:-1] > beyond[1]).any():
+        if answer.status != 0 or (distant[0] @ answer.x[:-1] > distant[1]).any():
             raise InputError(f"could not decide whether it is empty ({answer.message})", path="polytope")
         return np.asarray(answer.x[:-1]) * units, float(answer.x[-1])
 
