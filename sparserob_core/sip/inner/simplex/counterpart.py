@@ -480,7 +480,9 @@ class Counterpart:
         """Return which rows ``(r,)`` no deviation enters."""
         masks = [np.zeros(0, dtype=bool)]
         for block in self.blocks:
-            is_certain = np.array([not (C.data.any() or d.any()) for C, d in zip(block.C, block.d, strict=True)], dtype=bool)
+            is_certain = np.array(
+                [not (C.data.any() or d.any()) for C, d in zip(block.C, block.d, strict=True)], dtype=bool
+            )
             mask = is_certain[block.part] if block.part.size else np.zeros(block.h.size, dtype=bool)
             if block.exact:  # one of the two opposites has a deviation
                 mask[: block.h.size // 2] = False
