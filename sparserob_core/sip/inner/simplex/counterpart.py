@@ -59,6 +59,9 @@ ROBUST = "feedback"  # what these programs are called where a solver fails on so
 PERTURBED = 1e-4  # of slopes: what a perturbed cost may leave; a hundredth of it is seen, and 1e-2 is another entry's
 # Of least squares within bounds, at most: what is left of a slope after some lowers a bound, which holds
 LEAST_SQUARES_PASSES = 20
+# Numbers in the table of rows that may get a multiplier; larger ones are left as they are. Ten times as many take
+# seconds in each round, and with a tenth plans of 100 pieces keep slopes.
+TIGHT_NUMBERS = 250_000
 INNER = 20  # steps of the simplex method that one of an interior point method takes as long as
 SAME_POINT_DISTANCE = 1e-12  # points of a set that are closer are one
 DRAWN = (
@@ -455,6 +458,8 @@ class Counterpart:
         is_tight = self._find_certain_rows() & (np.abs(slack) <= BELIEVED)
         candidates, changed = np.flatnonzero(is_active | is_tight), y.copy()
         linear = slope + weights * np.sign(self._x)
+        if candidates.size * columns.size > TIGHT_NUMBERS:
+            return
         for _ in range(LEAST_SQUARES_PASSES):
             residual = (linear + changed @ rows)[columns]
             table = rows[candidates][:, columns].T.toarray()
