@@ -272,8 +272,9 @@ class ConstraintFamily:
     excess : callable, optional
         ``excess(x, indices (k, d))``: the violations ``(k, r)`` at indices, computed without building rows.
     rounding : callable, optional
-        ``rounding(x, indices (k, d))``: bounds ``(k, r)`` of the rounding errors of ``row x - rhs``, where these may
-        exceed 1e-14 of the row and its right-hand side, since terms cancel. Lower bounds count them.
+        ``rounding(reach (n,), indices (k, d))``: bounds ``(k, r)`` of the rounding errors of ``row x - rhs`` at every
+        decision with ``|x| <= reach``, where these may exceed 1e-14 of the row and its right-hand side, since terms
+        cancel. Lower bounds count them.
     start : ndarray, shape (k, d), optional
         Indices that a method imposes first, for a family with ``uncertain`` rows.
     defines : bool, default False

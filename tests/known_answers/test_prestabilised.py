@@ -284,9 +284,52 @@ def test_margins_are_those_without(of: str, measured: dict[str, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_studies_that_do_not_know_an_inner_loop_say_so(honest: Path, tmp_path: Path) -> None:
-    options = posed()
-    with pytest.raises(InputError, match=r"policy\.prestabilise"):
-        sr.initial_states(options, out=tmp_path / "states")
-    with pytest.raises(InputError, match=r"prestabilise: null"):
-        sr.controller(honest, resolve=True)
+def test_initial_states_are_those_without(tmp_path: Path) -> None:
+    small = {"control": {"name": "piecewise_constant", "pieces": 5}}
+    changes = {"problem": {"initial_state": [0.1, 0.0]}, "policy": {"cost": "nominal"}, "dictionaries": small}
+    found, other = (
+        sr.initial_states(posed(gain, **changes), directions=8, values=2, out=tmp_path / str(gain))
+        for gain in ("auto", None)
+    )
+    assert found.outer.max(axis=0) == pytest.approx(other.outer.max(axis=0), rel=1e-6)
+    assert 1.0 < found.inner_area <= other.outer_area and other.inner_area <= found.outer_area
+    assert all(other.where(vertex * (1.0 - 1e-6)) != "outside" for vertex in found.inner) and found.costs.size >= 4
+    assert found.lower_bounds == pytest.approx(found.costs, rel=1e-6, abs=1e-9)
+    flow, rng = expm(0.4 * np.array([[0.0, 1.0, 0.0], [9.0, 0.0, 1.0], [0.0, 0.0, 0.0]])), np.random.default_rng(3)
+    for vertex, nominal, M in zip(found.inner, found.controls, found.gains, strict=True):
+        state, expected, innovations = vertex, vertex, list[np.ndarray]()
+        predicted = vertex
+        for k, K in enumerate(found.inner_gains):
+            innovations.append(state - predicted)
+            u = nominal[:, k] + K @ (state - expected) + sum(M[k, j] @ e for j, e in enumerate(innovations))
+            assert (np.abs(u) <= 8.0 + 1e-6).all() and abs(state[0]) <= 0.5 + 1e-6
+            predicted = flow[:2, :2] @ state + flow[:2, 2] * u
+            expected = flow[:2, :2] @ expected + flow[:2, 2] * nominal[:, k]
+            state = predicted + flow[:2, 2] * rng.choice([-0.3, 0.3])
+
+
+@pytest.mark.slow
+def test_plans_of_the_remaining_horizon_cost_what_they_cost_from_there(tmp_path: Path) -> None:
+    """At e^24: each is proven, and as cheap as the plan of a problem that begins in the state that was measured."""
+    changes: dict[str, Any] = {"horizon": 8.0, "initial_state": [0.3, 0.0], "disturbance": {"box": 0.1}}
+    nominal = {"policy": {"cost": "nominal"}}
+    outcome = run(posed(problem=changes, **nominal), tmp_path / "run")
+    controller, state, rng = (
+        sr.controller(outcome.directory, resolve=True),
+        np.array([0.3, 0.0]),
+        np.random.default_rng(1),
+    )
+    flow, resolved = expm(0.8 * np.array([[0.0, 1.0, 0.0], [9.0, 0.0, 1.0], [0.0, 0.0, 0.0]])), 0
+    for k in range(7):
+        u = controller.step(0.8 * k, state)
+        step = controller.steps[-1]
+        if step.resolved and k in (2, 5):
+            resolved += 1
+            rest = {**changes, "horizon": 8.0 - 0.8 * k, "initial_state": state.tolist()}
+            few = {"control": {"name": "piecewise_constant", "pieces": 10 - k}}
+            fresh = run(posed(problem=rest, dictionaries=few, **nominal), tmp_path / str(k))
+            assert step.cost == pytest.approx(fresh.result.cost, rel=1e-6)
+            assert step.lower_bound == pytest.approx(fresh.result.lower_bound, rel=1e-6)
+        state = flow[:2, :2] @ state + flow[:2, 2] * (u + rng.uniform(-0.1, 0.1))
+        assert controller.covered and abs(state[0]) <= 0.5
+    assert resolved == 2

@@ -80,9 +80,10 @@ class Case:
             problem, dictionary = on_one_grid(self.problem, self.disturbance)
             object.__setattr__(self, "problem", problem)
             object.__setattr__(self, "disturbance", dictionary)
-        times = np.union1d(self.control.breakpoints, self.control.breakpoints + self.problem.system.delay)
-        breakpoints = join_breakpoints(self.disturbance.breakpoints, times)
-        object.__setattr__(self, "disturbance", self.disturbance.on(breakpoints))
+        if self.policy is not None:
+            times = np.union1d(self.control.breakpoints, self.control.breakpoints + self.problem.system.delay)
+            breakpoints = join_breakpoints(self.disturbance.breakpoints, times)
+            object.__setattr__(self, "disturbance", self.disturbance.on(breakpoints))
         if self.policy is not None and self.control.functions == self.control.pieces:
             # as many independent functions as pieces make every control on these; the certificate writes its values
             object.__setattr__(self, "control", Dictionary.indicators(self.control.breakpoints))

@@ -14,6 +14,9 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.sip.convex_set import Array
 
 SAME = 1e-12  # relative to the horizon: nearer breakpoints are one up to rounding, as in a problem's records
+# Relative to the horizon: times that a problem gives as fractions of it, such as 9/15 and 12/20, may differ by so much
+# in doubles. With a tenth of it some of these are two; with a thousand times more, times are moved that are two.
+ROUNDED_TIME = 2.0**-49
 
 
 @final
@@ -63,10 +66,17 @@ def before(problem: OptimalControlProblem) -> list[float]:
 
 
 def join_breakpoints(times: Array, others: Array) -> Array:
-    """Return the increasing ``times``, of which those that differ from one of the ``others`` by rounding only are
-    replaced by it. Otherwise a control would measure what happens between the two."""
+    """Return the increasing ``times``, of which those that differ from one of the ``others`` by the rounding of a
+    fraction of the horizon only (`ROUNDED_TIME`) are replaced by it; never the first and the last.
+
+    No bound can be charged for such a difference. A control with unbounded gains that measures a block of the
+    disturbance for one unit in the last place knows it. So breakpoints of a problem in which a control measures at
+    fractions of the horizon, and a disturbance jumps at such, are the same where the fractions are.
+    """
     after = np.clip(np.searchsorted(others, times), 1, others.size - 1)
     before, behind = others[after - 1], others[after]
     nearest = np.where(times - before <= behind - times, before, behind)
-    joined: Array = np.where(np.abs(nearest - times) <= SAME * times[-1], nearest, times)
+    is_same = np.abs(nearest - times) <= ROUNDED_TIME * times[-1]
+    is_same[[0, -1]] = False
+    joined: Array = np.where(is_same, nearest, times)
     return joined if (np.diff(joined) > 0.0).all() else times

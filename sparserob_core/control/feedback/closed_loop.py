@@ -9,6 +9,7 @@ With the effects ``F`` of the gains, the control on piece ``k`` is ``u_k = v_k +
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, final
@@ -18,6 +19,7 @@ import numpy as np
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.feedback.innovations import KNOWN, Answers, build_innovations
 from sparserob_core.control.feedback.observer import Observer, innovations_of
+from sparserob_core.control.feedback.prestabilised import SampledPlant
 from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -132,6 +134,21 @@ class ClosedLoop:
     def gains(self, x: Array) -> Array:
         """Return the gains ``M (K, K, m, d)`` at the decision ``x (n,)``."""
         return self.answers.gains(x[self.nominal_size : self.nominal_size + self.answers.variables])
+
+    def respond(self, x: Array, innovations: Sequence[Array]) -> Array:
+        """Return what is added to the nominal control on every piece, ``(m, K)``, by the ``innovations (d,)`` that were
+        measured so far, if nothing more happens than that."""
+        gains, measured = self.gains(x), np.array(innovations)
+        answered = np.einsum("kjmd,jd->km", gains[:, : len(measured)], measured)
+        if not self.inner.acts:
+            return np.asarray(answered.T)
+        response, none = self.functionals.response, np.zeros(self.functionals.response.system.disturbances)
+        plant, state = SampledPlant.of(response, self.functionals.dictionary, none, none), np.zeros(self.start.size)
+        for k, (Phi, Gamma) in enumerate(zip(plant.Phi, plant.Gamma, strict=True)):
+            state = state + measured[k] if k < len(measured) else state
+            answered[k] += self.inner.gains[k] @ state
+            state = Phi @ state + Gamma @ answered[k]
+        return np.asarray(answered.T)
 
     def written(self, x: Array | None) -> dict[str, Array]:
         """Return the arrays of the feedback that are stored in files: its ``gains`` at the decision ``x``, if there is

@@ -27,7 +27,6 @@ def refuse_remaining(model: Transcription) -> None:
         "integrals of controls alone, and none beside feedback: what states add up to between measurements is not"
         " known": any(model.feedback is not None or np.any(entry.H) for entry in combine_states(model.stated).integral),
         "a control that acts at once, without a delay": problem.system.delay > 0.0,
-        "a policy without an inner loop (prestabilise: null)": model.response.inner.acts,
         "a policy that measures the whole state, not outputs": model.feedback is not None
         and problem.measurements is not None,
         "a control_step with flat sides, and no feedback beside it, where the plan repeats": bool(problem.repeat)

@@ -159,8 +159,7 @@ class ProvenPlan:
         feedback = self.known.feedback
         if feedback is None:
             return nominal
-        gains = feedback.loop.gains(self.decision)[piece:, : len(innovations)]
-        return np.asarray(nominal + np.einsum("kjmd,jd->mk", gains, np.array(innovations)))
+        return np.asarray(nominal + feedback.loop.respond(self.decision, innovations)[:, piece:])
 
     def remaining_cost(self, piece: int, innovations: Sequence[Array]) -> float:
         """Return the cost of the remaining control under feedback, from piece ``piece`` of this plan on: of the nominal

@@ -82,6 +82,8 @@ class Retuning:
         loop, signal = model.answering.loop, model.functionals.disturbance
         if model.answering.charge.cost not in ("nominal", "peak") or not loop.spread.is_box or loop.middles.any():
             return None
+        if loop.inner.acts:  # whose decided part is no control, and the remainder in open loop would amplify
+            return None
         if signal is None or signal.starts is None or signal.starts.size != grid.pieces or not _is_plain_problem(model):
             return None
         try:

@@ -19,6 +19,13 @@ _VERTEX_DIMENSIONS = 6
 _VERTEX_ROWS = 200
 _SWEEPS = 12
 _ORDINARY = 10  # binary orders of magnitude of the scale factors within which rows and columns are not scaled
+# Binary orders of magnitude of the balanced numbers beyond which rows and units are chosen by the largest entries.
+# HiGHS refuses entries of 1e15 and drops those of 1e-9. With half of it sets that means balance well are scaled anew.
+_WIDE = 40
+# Largest right-hand side in the program of the Chebyshev centre, which is judged without the others. HiGHS takes those
+# of 1e20 as infinite, and with a thousandth of it sides would be left out of sets that are that far from 0.
+_FAR = 1e17
+_SQUARED = 400  # binary orders of magnitude of the largest entry of a row, beyond which its norm may not be a number
 _TOGETHER = 64  # linear programs that are solved as one
 _CLEAR, _NOTHING = 1e-6, 1e-14  # relative sizes above which a number is clearly not 0, and below which it is rounding
 _PROGRAMS = 96  # extreme points that are computed where the vertices are not known, one linear program each
@@ -76,11 +83,16 @@ class Polytope(ConvexSet):
                 f"empty, row {int(np.flatnonzero(zero & (h < 0))[0])} of H is zero and its h is negative",
                 path="polytope",
             )
+        exponents = np.frexp(np.abs(H).max(axis=1))[1]
+        factors = np.where(np.abs(exponents) > _SQUARED, -exponents, 0)
+        with np.errstate(over="ignore"):  # a side beyond all numbers is none
+            H, h = np.ldexp(H, factors[:, None]), np.ldexp(h, factors)
         keep = ~zero & np.isfinite(h)
         object.__setattr__(self, "H", H[keep])
         object.__setattr__(self, "h", h[keep])
         sealed(self)
-        if self.chebyshev[1] < -1e-9 * max(1.0, float(np.abs(self._balanced_halfspaces[1]).max(initial=0.0))):
+        sides = np.abs(self._balanced_halfspaces[1])
+        if self.chebyshev[1] < -1e-9 * max(1.0, float(sides[sides <= _FAR].max(initial=0.0))):
             raise InputError("empty, no point satisfies every row of H x <= h", path="polytope")
 
     @property
@@ -125,8 +137,14 @@ class Polytope(ConvexSet):
         exponents = np.rint(np.concatenate([rows, columns[:-1]])).astype(int)
         if np.abs(exponents).max(initial=0) <= _ORDINARY:
             return self.H, self.h, np.ones(self.dimension)
-        factors, units = np.ldexp(1.0, exponents[: rows.size]), np.ldexp(1.0, exponents[rows.size :])
-        return self.H * factors[:, None] * units, self.h * factors, units
+        balanced = np.where(
+            is_nonzero, sizes + np.append(exponents[rows.size :], 0) + exponents[: rows.size, None], 0.0
+        )
+        if np.abs(balanced).max(initial=0.0) > _WIDE:
+            exponents = _balance_largest(np.where(is_nonzero, sizes, -np.inf), self.H > 0.0, exponents[rows.size :])
+        factors, units = exponents[: rows.size], exponents[rows.size :]
+        H = np.ldexp(self.H, factors[:, None] + units)
+        return H, np.ldexp(self.h, factors), np.ldexp(1.0, units)
 
     @cached_property
     def chebyshev(self) -> tuple[Array, float]:
@@ -141,7 +159,9 @@ class Polytope(ConvexSet):
         (rows, d), (H, h, units) = self.H.shape, self._balanced_halfspaces
         if rows == 0:
             return np.zeros(d), np.inf
-        cap = 1.0 + float(np.abs(h).max())
+        is_near = h <= _FAR
+        H, h, distant = H[is_near], h[is_near], (H[~is_near], h[~is_near])
+        cap = 1.0 + float(np.abs(h).max(initial=0.0))
         norms = np.linalg.norm(H, axis=1)
         answer = linprog(
             np.append(np.zeros(d), -1.0),
@@ -149,7 +169,7 @@ class Polytope(ConvexSet):
             h,
             bounds=[(None, None)] * d + [(None, cap)],
         )
-        if answer.status != 0:
+        if answer.status != 0 or (distant[0] @ answer.x[:-1] > distant[1]).any():
             raise InputError(f"could not decide whether it is empty ({answer.message})", path="polytope")
         return np.asarray(answer.x[:-1]) * units, float(answer.x[-1])
 
@@ -199,8 +219,9 @@ class Polytope(ConvexSet):
         A vertex is a point at which ``d`` rows meet and which no row excludes. The value is ``None`` where there are
         too many meetings, or where the set is empty up to rounding.
         """
-        corners = find_vertices(self.H, self.h)
-        return np.array([[float(a) for a in x] for x in corners]) if corners else None
+        H, h, units = self._balanced_halfspaces
+        corners = find_vertices(H, h)
+        return np.array([[float(a) for a in x] for x in corners]) * units if corners else None
 
     @shaped
     def _polish_vertices(self, points: Float[Array, "v d"], facets: list[list[int]]) -> Float[Array, "u d"]:
@@ -395,3 +416,26 @@ class Polytope(ConvexSet):
                 max(residual, float(np.abs(batch - y @ H).sum(axis=1).max())),
             )
         return 2.0 * abs(highest) / (1.0 - residual) if residual < 0.5 else np.inf
+
+
+def _balance_largest(
+    sizes: Array, is_positive: npt.NDArray[np.bool_], units: npt.NDArray[np.int_]
+) -> npt.NDArray[np.int_]:
+    """Return exponents ``(r + d,)`` of factors of rows and of units, from the logarithms ``sizes (r, d + 1)`` of the
+    entries of ``H`` and ``h``, the signs of ``H``, and first exponents of the ``units (d,)``.
+
+    The largest entry of every row of ``H`` becomes about 1. The rows with the largest entry at one coordinate bound it
+    from above or from below, by about their right-hand sides. The larger of the two nearest bounds becomes about 1.
+    """
+    H, h, d = sizes[:, :-1], sizes[:, -1], units.size
+    for _ in range(_SWEEPS):
+        largest, rows = (H + units).argmax(axis=1), -np.rint((H + units).max(axis=1)).astype(int)
+        nearest = np.full((2, d), np.inf)
+        side = is_positive[np.arange(len(H)), largest].astype(int)
+        np.minimum.at(nearest, (side, largest), np.where(np.isfinite(h), h + rows, np.inf))
+        bounds = np.where(np.isfinite(nearest), nearest, -np.inf).max(axis=0)
+        change = np.where(np.isfinite(bounds) & (np.abs(bounds) > _ORDINARY), np.rint(bounds), 0.0).astype(int)
+        if not change.any():
+            break
+        units = units + change
+    return np.concatenate([-np.rint((H + units).max(axis=1)).astype(int), units])

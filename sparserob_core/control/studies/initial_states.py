@@ -81,6 +81,11 @@ class InitialPlane:
             remember(self._programs, key, replace(program, A=A, b=b), START_PROGRAMS_KEPT)
         return self._programs[key]
 
+    def controls(self, decision: Array) -> Array:
+        """Return the nominal control ``(m, K)`` of a decision of a `support`, from the initial state that ends it."""
+        start = self._build_initial_state(decision[-2:])
+        return from_state(self.free.centred, start).pieces(decision[:-2])
+
     def rounded(self, z: Array, result: Result) -> Result:
         """The result of the program at ``z`` with a lower bound that steps of a system which changes with time do not
         raise."""
@@ -262,7 +267,9 @@ class InitialPlane:
     @cached_property
     def centred(self) -> Transcription:
         """The problem from the centre of the plane."""
-        return from_state(self.model, self._build_initial_state(np.zeros(2)))
+        around = np.zeros(self.model.problem.system.states)
+        around[list(self.states)] = self.radius
+        return from_state(self.model, self._build_initial_state(np.zeros(2)), around)
 
     @cached_property
     def beyond(self) -> Array:

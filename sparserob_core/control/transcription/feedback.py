@@ -29,7 +29,7 @@ from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.reach.sizes import row_sizes
 from sparserob_core.control.response.inner_loop import InnerLoop
 from sparserob_core.control.transcription.own_units import added_up, constraint_sides, fixed, units_of_steps
-from sparserob_core.control.transcription.program import EQUALS, build_program, ranges
+from sparserob_core.control.transcription.program import EQUALS, build_program, held_nominally, ranges
 from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import Acting, Feedback, Posed, ProgramPart, Transcription
 from sparserob_core.control.transcription.telling import Telling
@@ -95,6 +95,16 @@ class FeedbackModel(Acting):
         """Return this control with its measurements in the problem's ``own`` units."""
         measurements = self.first[1] if own is self.first[0] else _build_measurements(self.mask, theirs, own, units)[0]
         return replace(self, measurements=measurements)
+
+    def widen(self, posed: Posed, around: Array) -> Posed:
+        """Return the problem with the range that the decided part of the control has from its initial state, and from
+        those around it. With an inner loop this range depends on the state."""
+        inner = posed.response.inner
+        if not inner.acts:
+            return posed
+        reach = _bound_inner_loop(posed, _sample_plant(posed), inner.gains, around)
+        control = held_nominally(posed.problem, replace(inner, reach=reach)).control
+        return replace(posed, held=replace(posed.held, control=control))
 
     def from_state(self, model: Transcription, posed: Posed) -> Transcription:
         """Return the program of the same problem from another initial state; it shares the record of the measurements,
@@ -349,11 +359,7 @@ def build_inner_loop(
     """
     _refuse_inner_loop(problem)
     (K, m, d), scaled = (rough.control.pieces, problem.system.controls, problem.system.states), rough.problem
-    low, high = (np.zeros(scaled.system.disturbances),) * 2
-    if scaled.disturbance is not None:
-        low, high = ranges(scaled.disturbance)
-    plant = SampledPlant.of(rough.response, rough.control, low, high)
-    gains = np.zeros((K, m, d))
+    plant, gains = _sample_plant(rough), np.zeros((K, m, d))
     if wanted is None or isinstance(wanted, str):
         rows = _normalise_rows(rough.constraints, d)[:, :states]
         lengths = rough.control.lengths / scaled.horizon
@@ -361,17 +367,33 @@ def build_inner_loop(
         gains[:, :, :states] = measured.regulator(rows, scaled.control.reach(np.eye(m)), lengths)
     else:
         gains[:, :, :states] = _read_gains(wanted, (K, m, states)) * units.states[:states] / units.controls[:, None]
-    initial = np.asarray(scaled.initial_state, dtype=float)
-    around = np.zeros((2, d)) if scaled.initial_set is None else np.array(ranges(scaled.initial_set))
-    times = rough.control.breakpoints
-    windows = [(entry.set, entry.start, end_of(entry.stop, scaled.horizon))
-               for entry in scaled.of_states if entry.relative_to is None]  # fmt: skip
-    windows += [(end, scaled.horizon, scaled.horizon) for end in scaled.ends]
+    reach = _bound_inner_loop(rough, plant, gains, np.zeros(d))
+    return InnerLoop(gains * units.controls[:, None] / units.states, reach * units.controls)
+
+
+def _bound_inner_loop(posed: Posed, plant: SampledPlant, gains: Array, around: Array) -> Array:
+    """Return a bound ``(m,)`` of ``|K_k x_k|`` under every control that keeps the constraints of a problem, in its
+    units, for ``gains (K, m, d)`` and from every initial state that differs from that of the problem by at most
+    ``around (d,)``."""
+    problem, times = posed.problem, posed.control.breakpoints
+    initial = np.asarray(problem.initial_state, dtype=float)
+    low, high = (0.0, 0.0) if problem.initial_set is None else ranges(problem.initial_set)
+    windows = [(entry.set, entry.start, end_of(entry.stop, problem.horizon))
+               for entry in problem.of_states if entry.relative_to is None]  # fmt: skip
+    windows += [(end, problem.horizon, problem.horizon) for end in problem.ends]
     constraints = [
         StateRows(*_find_sides(convex), (times >= start) & (times <= stop)) for convex, start, stop in windows
     ]
-    reach = plant.bound(gains, (initial + around[0], initial + around[1]), ranges(scaled.control), constraints)
-    return InnerLoop(gains * units.controls[:, None] / units.states, reach * units.controls)
+    bounds = initial + low - around, initial + high + around
+    return plant.bound(gains, bounds, ranges(problem.control), constraints)
+
+
+def _sample_plant(posed: Posed) -> SampledPlant:
+    """Return the plant of a problem from breakpoint to breakpoint of its control, with all its disturbances."""
+    low, high = (np.zeros(posed.problem.system.disturbances),) * 2
+    if posed.problem.disturbance is not None:
+        low, high = ranges(posed.problem.disturbance)
+    return SampledPlant.of(posed.response, posed.control, low, high)
 
 
 def _read_gains(wanted: npt.ArrayLike, shape: tuple[int, int, int]) -> Array:

@@ -73,6 +73,10 @@ class OpenLoopModel(Acting):
         activity = np.outer(problem.counts, control.lengths).ravel()
         return ProgramPart(families=families, activity=activity, settle=_land(posed))
 
+    def widen(self, posed: Posed, around: Array) -> Posed:
+        """Return the problem as it is: the range of a control in open loop is its set."""
+        return posed
+
     def from_state(self, model: Transcription, posed: Posed) -> Transcription:
         """Return the program of the same problem from another initial state. Everything that does not depend on this
         state is shared, and the families are in their reduced form only."""

@@ -131,6 +131,11 @@ class Acting(ABC):
         """Return the part of the program of a posed problem, in these units, that depends on this law."""
 
     @abstractmethod
+    def widen(self, posed: Posed, around: Array) -> Posed:
+        """Return the problem with the range that the decision has from its initial state, and from every one that
+        differs from it by at most ``around (d,)``."""
+
+    @abstractmethod
     def from_state(self, model: Transcription, posed: Posed) -> Transcription:
         """Return the program of the same problem from another initial state, explained as the program of ``model``
         is."""

@@ -331,16 +331,18 @@ def _compute_row_ratios(one: StateConstraint, other: StateConstraint) -> Array:
     return ratios(theirs, ours, np.ones(ours.shape[1]))
 
 
-def from_state(model: Transcription, initial_state: Array) -> Transcription:
+def from_state(model: Transcription, initial_state: Array, around: Array | None = None) -> Transcription:
     """Return the reduced program of the same problem from another initial state ``(d,)``; everything that does not
-    depend on this state is shared."""
-    posed = replace(
+    depend on this state is shared. The decision has the range that it needs from every initial state that differs from
+    this one by at most ``around (d,)``, by default 0."""
+    posed: Posed = replace(
         model,
         problem=replace(model.problem, initial_state=initial_state),
         held=replace(model.held, initial_state=initial_state),
         functionals=model.functionals.from_state(initial_state),
         constraints=tuple(constraint.from_state(initial_state) for constraint in model.constraints),
     )
+    posed = model.acting.widen(posed, np.zeros_like(initial_state) if around is None else around)
     return replace(model.acting.from_state(model, posed), given=model.given)
 
 

@@ -30,6 +30,8 @@ class InitialStates:
     one proven to contain it, in the units of the states. ``controls (k, m, K)``: a control for each vertex of
     ``inner``; between them, convex combinations serve. Under feedback these are the nominal ones, with the ``gains (k,
     K, K, m, d)`` of their policies, and the set is that from which some affine policy satisfies every constraint.
+    ``inner_gains (K, m, d)``: those of an inner loop, the same for all, by which the control answers how far the state
+    is from the nominal one.
     ``directions (n, 2)`` with ``bounds (n,)``: half-planes
     ``d'x <= bound`` that contain the set, and ``reached (n,)``: what proven points reach. ``points (v, 2)`` with
     ``costs (v,)``: initial states and the cost of a proven control from each, and ``lower_bounds (v,)`` of its optimum.
@@ -48,6 +50,7 @@ class InitialStates:
     outer: Array = field(default_factory=lambda: np.zeros((0, 2)))
     controls: Array = field(default_factory=lambda: np.zeros((0, 0, 0)), repr=False)
     gains: Array = field(default_factory=lambda: np.zeros((0, 0, 0, 0, 0)), repr=False)
+    inner_gains: Array = field(default_factory=lambda: np.zeros((0, 0, 0)), repr=False)
     directions: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
     bounds: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     reached: Array = field(default_factory=lambda: np.zeros(0), repr=False)
@@ -174,7 +177,8 @@ class InitialStates:
             "lower_bounds",
             "origin",
         )
-        return {name: getattr(self, name) for name in (*names, *(["gains"] if self.gains.size else []))}
+        answers = [name for name in ("gains", "inner_gains") if getattr(self, name).size]
+        return {name: getattr(self, name) for name in (*names, *answers)}
 
     def rows(self) -> list[tuple[str, str]]:
         """Return the main results for a user, as rows of a table."""

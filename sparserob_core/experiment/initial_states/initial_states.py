@@ -72,8 +72,6 @@ def initial_states(
             expected="false, since a plan that repeats ends among its initial states, and not from elsewhere",
             got="true",
         )
-    if model.response.inner.acts:
-        raise InputError(path="policy.prestabilise", expected="null for initial states", got="an inner loop")
     if about is not None:
         added_states = np.asarray(model.problem.initial_state, dtype=float)[model.stated.system.states :]
         model = from_state(model, np.append(_check_about(about, model.stated), added_states))
@@ -96,7 +94,7 @@ def initial_states(
 
 def _convert_to_user_units(own: InitialStates, units: Units, limit: float | None) -> InitialStates:
     """Convert results from the problem's own units to the user's units; ``limit`` is the bound that the user gave."""
-    x = units.states[list(own.states)]
+    x, per_state = units.states[list(own.states)], units.controls[:, None] / units.states
     normals, outer = own.directions / x, own.outer * x
     norms = np.linalg.norm(normals, axis=1)
     return replace(
@@ -104,7 +102,8 @@ def _convert_to_user_units(own: InitialStates, units: Units, limit: float | None
         inner=own.inner * x,
         outer=outer,
         controls=own.controls * units.controls[:, None] if own.controls.size else own.controls,
-        gains=own.gains * units.controls[:, None] / units.states if own.gains.size else own.gains,
+        gains=own.gains * per_state if own.gains.size else own.gains,
+        inner_gains=own.inner_gains * per_state if own.inner_gains.size else own.inner_gains,
         directions=normals / norms[:, None],
         bounds=own.bounds / norms,
         reached=own.reached / norms,

@@ -139,6 +139,7 @@ class InitialStatesSearch:
             outer=outer,
             controls=np.array([self.controls[vertex.tobytes()] for vertex in inner]),
             gains=np.array([self.gains[vertex.tobytes()] for vertex in inner]) if self.gains else bare.gains,
+            inner_gains=plane.model.response.inner.gains,
             directions=normals,
             bounds=np.array([s.bound for s in supports]) / norms + normals @ plane.centre,
             reached=(normals @ vertices.T).max(axis=1, initial=-np.inf),
@@ -238,7 +239,7 @@ class InitialStatesSearch:
         bound = bound if result.status == "infeasible" else min(-result.lower_bound, bound)
         point = None if result.decision is None else np.array(result.decision[-2:])
         if point is not None and proven and result.decision is not None:
-            self.controls[point.tobytes()] = self.plane.model.pieces(result.decision[:-2])
+            self.controls[point.tobytes()] = self.plane.controls(result.decision)
             feedback = self.plane.model.feedback
             if feedback is not None:
                 self.gains[point.tobytes()] = feedback.loop.gains(result.decision[:-2])

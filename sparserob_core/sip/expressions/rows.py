@@ -141,14 +141,24 @@ class ExpressionRows:
         return np.concatenate(columns, axis=1)
 
     @shaped
-    def roundings(self, x: Float[Array, " n"], indices: Float[Array, "k d"]) -> Float[Array, "k r"]:
-        """Return bounds of the rounding errors of the violations ``G x - h`` that `evaluate` gives at indices.
+    def roundings(self, reach: Float[Array, " n"], indices: Float[Array, "k d"]) -> Float[Array, "k r"]:
+        """Return bounds of the rounding errors of the rows ``G x <= h`` that `evaluate` gives at indices, for every
+        decision with ``|x| <= reach``.
 
-        Where the terms of a row cancel, the error is no share of what is left of them.
+        Where the terms of a coefficient cancel, its error is no share of what is left of them.
         """
         G, h = self.evaluate(indices)
-        coefficients, errors = self._build_models(taylor_space(self.dimension, 1), x, indices, indices)
-        bounds = errors.T + np.abs(coefficients[:, :, 0].T - (G @ x - h))
+        space = taylor_space(self.dimension, 1)
+        variables, parts = self._variables(space, indices, indices), dict[str, Value]()
+        bounds = np.empty(h.shape)
+        for i, row in enumerate(self.rows):
+            form = row.form(variables, parts=parts)
+            constant, coefficient = (self._as_models(part, space) for part in (form.constant, form.coefficient))
+            exact, errors = np.zeros((2, *G[:, i].shape))
+            np.add.at(exact.T, form.position, coefficient.coefficients[..., 0].T)
+            np.add.at(errors.T, form.position, coefficient.remainder.T)
+            bounds[:, i] = np.abs(constant.coefficients[:, 0, 0] + h[:, i]) + constant.remainder[:, 0]
+            bounds[:, i] += (np.abs(exact - G[:, i]) + errors) @ reach
         return np.where(np.isfinite(bounds), bounds, np.inf)  # a model may have no value where the row has one
 
     def _build_models(self, space: TaylorSpace, x: Array, lower: Array, upper: Array) -> tuple[Array, Array]:

@@ -258,23 +258,38 @@ class RelaxedProgram:
             self._bound_without_multipliers(plain, solution),
             *(self._prove_bound(plain, solution, *offer) for offer in offers),
         ]
-        bound, y, mu, z, at = proven[int(np.argmax([proof[0] for proof in proven]))]
-        bound -= self._bound_row_errors(rows, y[y.size - rows.h.size :], solution.x)
+        errors = self._bound_row_errors(rows, np.max([proof[1] for proof in proven], axis=0), solution.x)
+        bounds = [proof[0] - float(np.maximum(proof[1], 0.0) @ errors) for proof in proven]
+        best = int(np.argmax(bounds))
+        _, y, mu, z, at = proven[best]
         curved = plain.P is not None or plain.blocks is not None
-        return self.dual(rows, y, mu, solution.z if z is None else z, bound, at if curved else None)
+        return self.dual(rows, y, mu, solution.z if z is None else z, bounds[best], at if curved else None)
 
-    def _bound_row_errors(self, rows: Rows, y: Array, x: Array) -> float:
-        """Return the error that rounding may cause in a lower bound where terms of rows cancel, for ``x (n,)``
-        nearby."""
-        total, nearby = 0.0, np.where(np.isfinite(x), x, 0.0)
+    def _bound_row_errors(self, rows: Rows, y: Array, x: Array) -> Array:
+        """Return the errors ``(r,)`` that rounding may cause in the rows with a multiplier, where their terms cancel.
+
+        A lower bound speaks of an optimum, which may be far from the answer ``x (n,)``. An entry that is 0 in the
+        answer may be at its bound there, and its coefficient may be nothing but rounding. So the errors are those of
+        every decision within its bounds.
+        """
+        errors, first, reach = np.zeros(y.size), y.size - rows.h.size, self._bound_decision(x)
         for family in self.program.families:
             if family.rounding is None:
                 continue
-            used = [i for i in np.flatnonzero(y > 0.0).tolist() if rows.cuts[i].family == family.name]
+            used = [i for i in np.flatnonzero(y[first:] > 0.0).tolist() if rows.cuts[i].family == family.name]
             if used:
-                errors = family.rounding(nearby, np.array([rows.cuts[i].index for i in used]))
-                total += float(y[used] @ errors[np.arange(len(used)), [rows.cuts[i].row for i in used]])
-        return total
+                bounds = family.rounding(reach, np.array([rows.cuts[i].index for i in used]))
+                errors[first + np.array(used)] = bounds[np.arange(len(used)), [rows.cuts[i].row for i in used]]
+        return errors
+
+    def _bound_decision(self, x: Array) -> Array:
+        """Return how large the entries of a decision may be, ``(n,)``: as their bounds, and as twice the answer
+        ``x (n,)`` where they have none (`_bound_free_slopes`)."""
+        base, nearby = self.program.finite, 2.0 * np.abs(np.where(np.isfinite(x), x, 0.0))
+        if base.S is not None:
+            return nearby
+        largest = np.maximum(np.abs(base.lower), np.abs(base.upper))
+        return np.where(np.isfinite(largest), largest, nearby)
 
     def _bound_without_multipliers(self, plain: FiniteProgram, solution: FiniteSolution) -> _Proven:
         """The bound of no multipliers at all, which is the same again and again where the cost is linear."""

@@ -196,6 +196,21 @@ def test_breakpoints_that_differ_by_rounding_are_one() -> None:
     assert 12 not in {block for members in bound._cluster_breakpoints(9) for block in bound._list_blocks(members)}
 
 
+def test_breakpoints_are_moved_for_what_is_measured_alone_and_by_rounding_alone() -> None:
+    """In open loop every time is taken as it is, and so are the last one and those that differ by more."""
+    problem = sr.OptimalControlProblem(
+        system=LinearSystem([[0.0, 1.0], [9.0, 0.0]], ONE, ONE), horizon=3.0, initial_state=[0.3, 0.0],
+        control=Box([-3.0], [3.0]), disturbance=Box([-0.3], [0.3]),
+    )  # fmt: skip
+    control = sr.Dictionary.indicators(np.linspace(0.0, 3.0, 16))
+    near = control.breakpoints + 3.0 * np.array([0.0, 1e-13, *[1e-16] * 13, 2e-16])
+    disturbance = sr.Dictionary.indicators(near)
+    in_open_loop = Case(problem, control, disturbance, {})
+    assert in_open_loop.disturbance.breakpoints.tolist() == near.tolist()
+    answering = Case(problem, control, disturbance, {}, policy=AffinePolicy())
+    assert answering.disturbance.breakpoints.tolist() == [0.0, near[1], *control.breakpoints[2:-1], near[-1]]
+
+
 HONEST = {
     "breakpoints that differ by rounding": (
         {"A": [[0, 1], [9, 0]], "B": [[0], [1]], "E": [[0], [1]]}, 3.0, [0.3, 0], 3.0, 0.3, [0.1, 0.3],

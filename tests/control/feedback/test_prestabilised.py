@@ -3,6 +3,8 @@ for every control that keeps the constraints; states, rows and rounding errors o
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
@@ -18,7 +20,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.control.transcription.transcribe import prepare
+from sparserob_core.control.transcription.transcribe import from_state, prepare
 from sparserob_core.sip.convex_set import Box
 
 PENDULUM = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, -0.2, 2.7, 0.0], [0.0, 0.0, 0.0, 1.0], [0.0, -0.5, 31.0, 0.0]])
@@ -201,6 +203,35 @@ def test_what_a_loop_of_outputs_does_not_know_is_bounded_by_what_a_deviation_att
     assert not looped()[0].missing.any() and not looped()[0].widest.any()
 
 
+def test_what_is_decided_has_the_range_of_its_initial_state_and_of_those_around_it() -> None:
+    """That of a problem that begins there, or in a set of initial states."""
+    model, policy = _prepared(None), AffinePolicy(cost="peak", prestabilise=[[-12.0, -4.0]])
+    state, around = np.array([-0.3, 1.0]), np.array([0.1, 0.5])
+    first = prepare(model.problem, model.control, model.disturbance, policy=policy)
+    there = replace(model.problem, initial_state=state)
+    within = replace(there, initial_set=Box(-around, around))
+    expected = [prepare(each, model.control, model.disturbance, policy=policy) for each in (there, within)]
+    found = [from_state(first, state), from_state(first, state, around)]
+    ranges = [each.held.control.bounding_box().upper[0] for each in (first, *expected, *found)]
+    assert ranges[3:] == pytest.approx(ranges[1:3], rel=1e-6)
+    assert np.diff(np.sort(ranges[:3])).min() > 1e-3
+
+
+def test_what_is_left_of_the_control_answers_the_innovations_so_far() -> None:
+    """Stepped from breakpoint to breakpoint with two innovations, and none after them."""
+    (loop, x), none = looped(), np.zeros(1)
+    plant = SampledPlant.of(loop.functionals.response, loop.functionals.dictionary, none, none)
+    innovations, state = [np.zeros(2), np.array([0.03, -0.2]), np.array([-0.01, 0.1])], np.array([0.1, 0.0])
+    decided, M, controls = loop.decided(x)[:, :, 0], loop.gains(x), list[np.ndarray]()
+    for k in range(5):
+        known = innovations[: k + 1]
+        state = state + known[k] if k < len(known) else state
+        answered = sum((M[k, j] @ e for j, e in enumerate(known)), np.zeros(1))
+        controls.append(decided[k] + loop.inner.gains[k] @ state + answered)
+        state = plant.Phi[k] @ state + plant.Gamma[k] @ controls[-1]
+    assert loop.nominal(x) + loop.respond(x, innovations) == pytest.approx(np.array(controls).T, rel=1e-9)
+
+
 def test_gains_are_bounded_by_the_control_and_all_that_the_loop_adds() -> None:
     """A gain is as large as the range of the decided part lets it be: the control, and what acts on the estimate."""
     loop, _ = looped(SENSED)
@@ -246,7 +277,7 @@ def test_values_of_constraints_that_are_read_back_hold_of_every_trajectory(span:
     for sign in (1.0, -1.0, *rng.choice([1.0, -1.0], size=8)):
         u, w = sign * 5.0 * np.ones(6), sign * PUSH * rng.choice([1.0, -1.0], size=6)
         states = [rng.normal(size=4)]
-        for k in range(6):
+        for k in range(5):
             states.append(plant.Phi[k] @ states[-1] + plant.Gamma[k, :, 0] * (u[k] + w[k]))
         constraints = [StateRows(np.eye(4), states[j], states[j], np.arange(7) == j) for j in range(2, 2 + span)]
         rows, lower, upper = plant._read_constraints(1, span, (np.array([-5.0]), np.array([5.0])), constraints)

@@ -39,6 +39,29 @@ def test_flat_polytopes_have_their_vertices_and_keep_their_support():
     assert sorted(map(tuple, np.round(Polytope(*SQUARE).vertices, 9).tolist())) == [(-1, -1), (-1, 1), (1, -1), (1, 1)]
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("size", [1e-200, 1e-30, 1e30, 1e200])
+def test_polytopes_of_numbers_of_very_different_sizes_have_their_support(size):
+    """Each set is a square, or one of which a row in other units cuts off nothing, or a half."""
+    (H, h), c = SQUARE, np.vstack([np.eye(2), -np.eye(2)])
+    cases = {
+        "a row in other units": ([*H, [size, size]], [*h, size], [1.0, 1.0, 1.0, 1.0]),
+        "a row through the middle, or far away": ([*H, [size, size]], [*h, 1.0], [1.0, 1.0, 1.0, 1.0]),
+        "an entry beside 1": ([*H, [0.0, 1.0], [size, 0.0]], [*h, 1.0, size], [1.0, 1.0, 1.0, 1.0]),
+        "entries of one row": ([*H, [size, 1.0]], [*h, max(size, 1.0)], [1.0, 1.0, 1.0, 1.0]),
+        "a side": ([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], [size, 1.0, 1.0, 1.0], [size, 1.0, 1.0, 1.0]),
+        "a coordinate": (H * [size, 1.0], h, [1.0 / size, 1.0, 1.0 / size, 1.0]),
+    }
+    for name, (rows, sides, expected) in cases.items():
+        polytope = Polytope(rows, sides)
+        widths = np.tile(np.add(expected[:2], expected[2:]), 2)
+        assert polytope.is_bounded and polytope.contains(polytope.interior_point()), name
+        assert polytope.support(c) / widths == pytest.approx(expected / widths, abs=1e-12), name
+        if name != "a side":  # of which 4 is no width
+            with pytest.raises(InputError, match="empty, no point"):
+                Polytope([*np.asarray(rows), [size, 0.0]], [*sides, -3.0 * size * expected[2]])
+
+
 @pytest.mark.parametrize(
     "bound", [Polytope(*SQUARE), Polytope([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]], [1.0, 0.5, 0.5])]
 )

@@ -185,7 +185,7 @@ def test_rounding_errors_of_rows_are_bounded_where_their_terms_cancel() -> None:
     rows = ExpressionRows.parse({"t": (-1.0, 1.0)}, texts, decision, {})
     indices, x = 10.0 ** rng.uniform(-9.0, 0.0, (200, 1)), rng.normal(size=2)
     G, h = rows.evaluate(indices)
-    bounds, largest = rows.roundings(x, indices), 0.0
+    bounds, largest = rows.roundings(np.abs(x), indices), 0.0
     assert bounds.shape == (200, 2)
     for k, index in enumerate(indices[:, 0].tolist()):
         t, (a, b) = Fraction(index), (Fraction(number) for number in x.tolist())
@@ -196,3 +196,11 @@ def test_rounding_errors_of_rows_are_bounded_where_their_terms_cancel() -> None:
             assert error <= bounds[k, row]
             largest = max(largest, error / bounds[k, row])
     assert largest > 1e-3
+
+
+def test_rounding_errors_of_rows_are_those_of_the_largest_decision() -> None:
+    rows = ExpressionRows.parse({"t": (0.0, 2.0)}, ["x[0] + x[1]*((1e16 + t) - 1e16) <= t"], Decisions({"x": 2}), {})
+    bounds = [
+        rows.roundings(np.array(reach), np.array([[1.0]]))[0, 0] for reach in ([1.0, 0.0], [1.0, 1.0], [1.0, 3.0])
+    ]
+    assert bounds[0] < 1e-14 and 1.0 <= bounds[1] <= 4.0 and bounds[2] == pytest.approx(3.0 * bounds[1])

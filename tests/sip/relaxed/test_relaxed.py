@@ -251,3 +251,12 @@ def test_a_lower_bound_counts_the_rounding_of_terms_that_cancel(power: float) ->
         exact = t - t**a
         assert Decimal(result.lower_bound) <= exact
     assert result.lower_bound == pytest.approx(float(exact), rel=0.1)
+
+
+def test_a_lower_bound_counts_the_rounding_of_entries_that_are_0_in_the_answer() -> None:
+    """The coefficient of ``a`` is 1. Its terms cancel to 0 in doubles, so that ``a`` looks worthless."""
+    family = sr.ConstraintFamily.from_expressions(
+        "f", index={"t": (1, 1)}, rows=["r + a*((1e16 + t) - 1e16) >= 1"], decision={"r": None, "a": None}
+    )
+    program = sr.SemiInfiniteProgram(n=2, q=[1, 0], weights=[0, 0.1], lower=[0, -1], upper=[9, 1], families=[family])
+    assert sr.solve(program).lower_bound <= 0.1

@@ -59,6 +59,9 @@ ROBUST = "feedback"  # what these programs are called where a solver fails on so
 PERTURBED = 1e-4  # of slopes: what a perturbed cost may leave; a hundredth of it is seen, and 1e-2 is another entry's
 # Of least squares within bounds, at most: what is left of a slope after some lowers a bound, which holds
 LEAST_SQUARES_PASSES = 20
+# Numbers in the table of rows that may get a multiplier; larger ones are left as they are. Ten times as many take
+# seconds in each round, and with a tenth plans of 100 pieces keep slopes.
+TIGHT_NUMBERS = 250_000
 INNER = 20  # steps of the simplex method that one of an interior point method takes as long as
 SAME_POINT_DISTANCE = 1e-12  # points of a set that are closer are one
 DRAWN = (
@@ -314,7 +317,7 @@ class Counterpart:
         for."""
         y, deviations = self._read_multipliers(even)
         priced = self.program if touched is None else self.program.tangent(touched)
-        if not (self.elastic or self.scales or any(block.exact for block in self.blocks)):
+        if not (self.elastic or self.scales):
             self._refine_multipliers(mu @ self.program.A + priced.q, priced.weights, y)
         terms = [(np.zeros(0, dtype=int), np.zeros(0))]
         late: list[tuple[UncertainRows, int, _Part, np.ndarray, float]] = []
@@ -322,7 +325,9 @@ class Counterpart:
         for block, (where, _, parts) in zip(self.blocks, self._imposed_rows, strict=True):
             multipliers = y[first : first + block.h.size]
             if not parts:
-                terms.append(weighted(even[where], block.equations[0]))
+                table = even[where].reshape(block.h.size // 2, -1).copy()
+                table[:, 0] = np.subtract(*multipliers.reshape(2, -1))
+                terms.append(weighted(table.ravel(), block.equations[0]))
             elif multipliers.any():
                 terms.append(weighted(multipliers, block.g))
             for p, part in enumerate(parts):
@@ -420,22 +425,86 @@ class Counterpart:
         ``slope (n,)`` and ``weights (n,)`` are those of the cost and of equalities. HiGHS perturbs costs by 1e-6, and
         its last basis may be that of perturbed costs, or too inexact for other ones.
         """
-        active = np.flatnonzero(y > 0.0)
+        sizes = self._find_adjustable_sizes(y)
+        active = np.flatnonzero(sizes > 0.0)
         if not active.size:
             return
-        table = csr_array(vstack([block.g for block in self.blocks]))[active]
+        rows = csr_array(vstack([block.g for block in self.blocks]))
         answering = [C.indices for block in self.blocks for C in block.C]
         is_inner = self._find_inner_variables() & ((weights == 0.0) | (self._x != 0.0))
         is_inner[np.concatenate(answering)] = False
-        residual = slope + weights * np.sign(self._x) + y[active] @ table
+        residual = slope + weights * np.sign(self._x) + y @ rows
         # of an answer that is no vertex, entries near a bound or near 0 have slopes of their own
         is_inner &= np.abs(residual) <= PERTURBED * max(1.0, float(np.abs(slope).max(initial=0.0)))
         columns = np.flatnonzero(is_inner)
-        residual = residual[columns]
-        if np.abs(residual).max(initial=0.0) <= HIGHS_ACCURACY:
+        if np.abs(residual[columns]).max(initial=0.0) <= HIGHS_ACCURACY:
             return
-        shares = table[:, columns].T.toarray() * y[active]
-        y[active] *= np.maximum(1.0 + np.linalg.lstsq(shares, -residual, rcond=SAME_POINT_DISTANCE)[0], 0.0)
+        shares = rows[active][:, columns].T.toarray() * sizes[active]
+        change = sizes[active] * np.linalg.lstsq(shares, -residual[columns], rcond=SAME_POINT_DISTANCE)[0]
+        y[active] = np.maximum(y[active] + change, 0.0)
+        linear = slope + weights * np.sign(self._x)
+        if np.abs(linear + y @ rows)[columns].max() > HIGHS_ACCURACY:
+            self._enter_tight_rows(slope, weights, rows, (sizes > 0.0), columns, y)
+
+    def _enter_tight_rows(
+        self, slope: Array, weights: Array, rows: csr_array, is_active: np.ndarray, columns: np.ndarray, y: Array
+    ) -> None:
+        """Correct multipliers, those of rows without one among them, such that less is left of slopes in ``columns``.
+
+        Multipliers below the tolerance of a solver are 0 in its answer. Rows that hold with equality in the answer, and
+        in which nothing deviates, may have one. A change is made only where it raises the bound.
+        """
+        slack = np.concatenate([block.h for block in self.blocks]) - rows @ self._x
+        is_tight = self._find_certain_rows() & (np.abs(slack) <= BELIEVED)
+        candidates, changed = np.flatnonzero(is_active | is_tight), y.copy()
+        linear = slope + weights * np.sign(self._x)
+        if candidates.size * columns.size > TIGHT_NUMBERS:
+            return
+        for _ in range(LEAST_SQUARES_PASSES):
+            residual = (linear + changed @ rows)[columns]
+            table = rows[candidates][:, columns].T.toarray()
+            changed[candidates] += np.linalg.lstsq(table, -residual, rcond=SAME_POINT_DISTANCE)[0]
+            is_negative = changed[candidates] < 0.0
+            if not is_negative.any():
+                break
+            changed, candidates = np.maximum(changed, 0.0), candidates[~is_negative]
+        before, after = (self._measure_shortfall(slope + each @ rows, weights) + each @ slack for each in (y, changed))
+        if after < before:
+            y[:] = changed
+
+    def _measure_shortfall(self, slope: Array, weights: Array) -> float:
+        """Return by how much the least cost of the variables within their bounds is below that of the last answer, for
+        these slopes and weights of absolute values."""
+        low, high = self.program.lower, self.program.upper
+        ends = np.stack([low, high, np.clip(0.0, low, high)])
+        with np.errstate(invalid="ignore"):
+            least = (weights * np.abs(ends) + np.where(slope == 0.0, 0.0, slope * ends)).min(axis=0)
+        return float((weights * np.abs(self._x) + slope * self._x - least).sum())
+
+    def _find_certain_rows(self) -> np.ndarray:
+        """Return which rows ``(r,)`` no deviation enters."""
+        masks = [np.zeros(0, dtype=bool)]
+        for block in self.blocks:
+            is_certain = np.array(
+                [not (C.data.any() or d.any()) for C, d in zip(block.C, block.d, strict=True)], dtype=bool
+            )
+            mask = is_certain[block.part] if block.part.size else np.zeros(block.h.size, dtype=bool)
+            if block.exact:  # one of the two opposites has a deviation
+                mask[: block.h.size // 2] = False
+            masks.append(mask)
+        return np.concatenate(masks)
+
+    def _find_adjustable_sizes(self, y: Array) -> Array:
+        """Return the sizes ``(r,)`` of multipliers that may change, 0 for others: those of rows with multipliers, and
+        of the opposites of equations, which have no deviations, those of both."""
+        sizes, first = y.copy(), 0
+        for block in self.blocks:
+            half = block.h.size // 2
+            if block.exact:
+                sizes[first + half : first + block.h.size] = y[first : first + block.h.size].reshape(2, -1).max(axis=0)
+                sizes[first : first + half] = 0.0
+            first += block.h.size
+        return sizes
 
     def _refine_deviations(self, slope: Array, free: np.ndarray, y: Array, deviations: Array) -> None:
         """Correct the deviations of rows, such that less slope is left in the variables that answer them.
@@ -505,7 +574,9 @@ class Counterpart:
 
     def _bound_variables(self, columns: np.ndarray, slope: Array) -> float:
         """Return the least value of variables in ``columns`` within their bounds, times their ``slope``."""
-        return float(np.minimum(slope * self.program.lower[columns], slope * self.program.upper[columns]).sum())
+        bounds = np.where(slope > 0.0, self.program.lower[columns], self.program.upper[columns])
+        is_sloped = slope != 0.0  # what has no slope adds nothing, also where it has no bound
+        return float(slope[is_sloped] @ bounds[is_sloped])
 
 
 @final

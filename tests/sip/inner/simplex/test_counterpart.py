@@ -18,7 +18,7 @@ from sparserob_core.sip.finite import Blocks, FiniteProgram, Spread, UncertainRo
 from sparserob_core.sip.inner.simplex import counterpart as simplex
 from sparserob_core.sip.inner.simplex.counterpart import Counterpart, Growing, RobustAnswer, robust_bound
 
-N, Q = 4, 3
+N, Q, EMPTY = 4, 3, np.zeros(0)
 BOX = Spread(((1, Box(np.array([-0.5, -1.0]), np.array([0.5, 1.0]))), (1, Box(np.array([-0.25]), np.array([0.25])))))
 POINTED = Spread(((1, NormBall(p=1.0, radius=0.75, dimension=2)), (1, Box(np.array([0.5]), np.array([2.0])))))
 SPREADS = {"box": BOX, "pointed": POINTED}
@@ -410,3 +410,57 @@ def test_deviations_move_only_where_this_raises_the_bound(constant: float) -> No
     assert bound(moved, found) == pytest.approx(max(before, bound(np.zeros(4), shares + change)), abs=1e-15)
     assert np.array_equal(found, shares + change if is_better else shares)
     assert np.array_equal(moved, slope) != is_better
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_variable_without_an_end_adds_nothing_where_no_slope_is_left() -> None:
+    none = np.zeros((0, 2))
+    free = FiniteProgram(
+        np.zeros(2), np.zeros(2), np.array([-np.inf, -2.0]), np.array([np.inf, 3.0]), none, EMPTY, none, EMPTY
+    )
+    counterpart, columns = Counterpart(free, BOX), np.array([0, 1])
+    assert counterpart._bound_variables(columns, np.array([0.0, 1.5])) == -3.0
+    assert counterpart._bound_variables(columns, np.array([0.0, -1.5])) == -4.5
+    assert counterpart._bound_variables(columns, np.array([1e-300, 1.5])) == -np.inf
+
+
+@pytest.mark.parametrize("left_out", [0.0, 1e-8])
+def test_multipliers_that_a_solver_leaves_out_or_rounds_are_found_for_a_plan_that_ends_at_a_point(
+    left_out: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``x_{k+1} = x_k/10 + v_k`` with ``u_k = v_k - 2 x_k``, and ``sum |u_k|`` least. Multipliers decay by a tenth."""
+    count, reach = 12, 100.0
+    after = np.array([[0.1 ** (k - 1 - j) if j < k else 0.0 for j in range(count)] for k in range(count + 1)])
+    free = 0.1 ** np.arange(count + 1)
+    u = np.hstack([np.eye(count) - 2.0 * after[:-1], np.zeros((count, count))])
+    peaks = np.hstack([np.zeros((count, count)), np.eye(count)])
+    none, lower = np.zeros((0, 2 * count)), np.repeat([-reach, 0.0], count)
+    base = FiniteProgram(
+        np.zeros(2 * count), np.repeat([0.0, 1.0], count), lower, np.full(2 * count, reach), none, EMPTY, none, EMPTY
+    )
+
+    def block(g: Array, h: Array, exact: bool = False) -> UncertainRows:
+        table = csr_array((Q, 2 * count))
+        return UncertainRows(
+            csr_array(g), h, np.zeros(h.size, dtype=int), np.ones(h.size), (table,), np.zeros((1, Q)), exact
+        )
+
+    end = np.append(after[-1], np.zeros(count))
+    blocks = [
+        block(np.vstack([u - peaks, -u - peaks]), np.concatenate([2.0 * free[:-1], -2.0 * free[:-1]])),
+        block(np.vstack([end, -end]), np.array([-free[-1], free[-1]]), exact=True),
+    ]
+    counterpart, rng = Counterpart(base, BOX), np.random.default_rng(1)
+    for each in blocks:
+        counterpart.add(each)
+    solve = counterpart._linear.solve
+
+    def solve_roughly(seconds: float = np.inf) -> tuple[bool, str, Array, Array]:
+        solved, message, columns, multipliers = solve(seconds)
+        rough = multipliers * (1.0 + 1e-8 * rng.standard_normal(multipliers.size))
+        return solved, message, columns, np.where(np.abs(rough) < left_out, 0.0, rough)
+
+    monkeypatch.setattr(counterpart._linear, "solve", solve_roughly)
+    answer = counterpart.solve()
+    proven = robust_bound(base, blocks, answer.y, answer.deviations, answer.mu, priced=True).value
+    assert (answer.y >= 0.0).all() and proven == pytest.approx(base.objective(answer.x), abs=1e-12)
