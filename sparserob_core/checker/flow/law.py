@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
-from itertools import pairwise, product
-from math import ceil, comb, floor, inf, log2
+from itertools import pairwise
+from math import ceil, floor, inf, log2
 from typing import final
 
 import numpy as np
@@ -156,8 +156,7 @@ def _truncate_powers(A: list[Series], units: Array) -> list[Series]:
 @dataclass(frozen=True, eq=False)
 class Law:
     """The law of a ``plant`` up to the time ``until`` over a ``box`` of parameters, to a ``degree`` in the parameters.
-    With a ``timing`` it has the stretches of that law. Where that law is sharp on a box around this one, it is this law
-    too: its polynomials in the parameters are moved to this box, and no entry is evaluated anew."""
+    With a ``timing`` it has the stretches of that law."""
 
     plant: Plant
     until: float
@@ -214,16 +213,6 @@ class Law:
         return np.asarray(np.any([stretch.sizes[0] > 0.0 for stretch in self.stretches], axis=0))
 
     @cached_property
-    def degrees(self) -> np.ndarray:
-        """The degree in the parameters of every entry of ``[A B c E]``, ``(d, d + w)``; -1 for an entry that is 0."""
-        degrees = np.full(self.there.shape, -1)
-        for stretch in self.stretches:
-            for degree, table in zip(self.monomials.degrees, stretch.table, strict=True):
-                is_nonzero = np.array([[entry.length() > 0 for entry in row] for row in table])
-                degrees = np.where(is_nonzero, np.maximum(degrees, degree), degrees)
-        return degrees
-
-    @cached_property
     def weights(self) -> Array:
         """The approximate size of the part of the law that belongs to each monomial of the parameters, ``(M,)``."""
         weights = np.zeros(self.monomials.size)
@@ -233,68 +222,11 @@ class Law:
 
     def _rebuild_stretch(self, other: Stretch) -> Stretch:
         """Return the law of this box on a stretch of the timing."""
-        if self.timing is not None and self.timing.covers(self.box):
-            return replace(other, frame=Frame(self.monomials, ORDER), table=self._recentre_table(self.timing, other))
         phase = next(phase for phase in reversed(self.plant.phases) if phase.begin <= other.start)
         frame, table = self._tabulate_law(other.start, other.stop, phase, self.monomials)
         return replace(
             other, frame=frame, table=table, stride=min(other.stride, _round_up_to_power(other.stop - other.start))
         )
-
-    def _recentre_table(self, wide: Law, stretch: Stretch) -> list[list[list[arb_poly]]]:
-        """Return the table of this box on a ``stretch`` of a law on a box around it. What is beyond the degree is in
-        the balls of the constant coefficient."""
-        around = arb(0, 1)
-        rows, columns = len(stretch.table[0]), len(stretch.table[0][0])
-        tables = [[[arb_poly([])] * columns for _ in range(rows)] for _ in range(self.monomials.size)]
-        for terms, outer in zip(self._expand_monomials(wide), stretch.table, strict=True):
-            entries = [(i, j, outer[i][j]) for i in range(rows) for j in range(columns) if outer[i][j].length()]
-            for number, factor in terms:
-                for i, j, entry in entries:
-                    moved = entry * factor
-                    if number is None:
-                        tables[0][i][j] += arb_poly([c * around for c in moved.coeffs()])
-                    else:
-                        tables[number][i][j] += moved
-        return tables
-
-    def _expand_monomials(self, wide: Law) -> list[list[tuple[int | None, arb]]]:
-        """Return every monomial of a law on a box around this one as a polynomial on this box: numbers of monomials
-        with their factors; ``None`` stands for a monomial beyond the degree."""
-        moves = []
-        for centre, half, middle, own in zip(
-            wide.box.middle, wide.box.halves, self.box.middle, self.box.halves, strict=True
-        ):
-            unit = arb(half) if half else arb(1)
-            moves.append(((arb(middle) - arb(centre)) / unit, arb(own) / unit))
-        expanded = list[list[tuple[int | None, arb]]]()
-        for e in wide.monomials.exponents:
-            terms = list[tuple[int | None, arb]]()
-            for f in product(*(range(n + 1) for n in e)):
-                factor = arb(1)
-                for n, k, (c, r) in zip(e, f, moves, strict=True):
-                    factor *= comb(n, k) * c ** (n - k) * r**k
-                if not factor.is_zero():
-                    constant = None if any(f) else 0
-                    terms.append((self.monomials.number.get(f) if self.degree else constant, factor))
-            expanded.append(terms)
-        return expanded
-
-    def covers(self, box: ParameterBox) -> bool:
-        """Return True where the law of a ``box`` follows from the polynomials of this law, without a loss."""
-        is_expanded = self.degree > 0 or not any(self.box.halves)  # to degree 0 it is the law in the middle alone
-        return is_expanded and self.box.holds(box) and self.is_sharp
-
-    @cached_property
-    def is_sharp(self) -> bool:
-        """True where all polynomials are known up to rounding, over the whole box, at every time."""
-        d, u = self.plant.states, self.units
-        for stretch in self.stretches:
-            radii = np.sum([_sum_radii(table) for table in stretch.table], axis=0)
-            rate = pace(bound_entries(stretch.table[0])[:, :d], u)
-            if not self._has_small_radii(radii, rate, stretch.units / u):
-                return False
-        return True
 
     def _has_small_radii(self, radii: Array, rate: float, ratios: Array) -> bool:
         """Return True where the radii ``(d, d + w)`` of a law are small next to its numbers, in the units of a stretch,
