@@ -69,7 +69,7 @@ def is_semidefinite(matrix: fmpq_mat) -> bool:
         pivot = pivot_row[k]
         if pivot < 0 or (pivot == 0 and any(x != 0 for x in pivot_row[k:])):
             return False
-        for row in rows[k + 1 :] if pivot else ():
+        for row in rows[k + 1 :] if pivot != 0 else ():
             share = row[k] / pivot
             row[k:] = [a - share * b for a, b in zip(row[k:], pivot_row[k:], strict=True)]
     return bool(matrix == matrix.transpose())

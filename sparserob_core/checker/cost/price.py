@@ -52,11 +52,6 @@ class Price:
     )
     _motions_by_precision: dict[int, NominalMotion] = field(default_factory=dict)
 
-    @cached_property
-    def _piece_lengths(self) -> list[Fraction]:
-        ends = [Fraction(t) for t in self.clock.each(self.control.breakpoints.tolist())]
-        return [b - a for a, b in self.clock.each(pairwise(ends))]
-
     @property
     def is_quadratic(self) -> bool:
         return any(term is not None for term in self._quadratic_terms)
@@ -184,7 +179,7 @@ class Price:
     @cached_property
     def _zero_control(self) -> list[arb_mat]:
         """The control that stays 0."""
-        return [stacked([[ball(0)]] * self.problem.system.controls)] * len(self._piece_lengths)
+        return [stacked([[ball(0)]] * self.problem.system.controls)] * self.control.pieces
 
     def _evaluate_quadratic(self, pieces: Sequence[arb_mat]) -> QuadraticTerms:
         """Return the quadratic terms and their slopes, at the working precision that they need; the latest are

@@ -202,11 +202,6 @@ class Law:
             for stretch in self._divide_phase(begin, until, phase)
         ]
 
-    @property
-    def is_still(self) -> bool:
-        """True where every stretch `Stretch.is_still`."""
-        return all(stretch.is_still for stretch in self.stretches)
-
     @cached_property
     def there(self) -> np.ndarray:
         """The entries of ``[A B c E]`` that may differ from 0 at some time and parameter, Booleans ``(d, d + w)``."""
