@@ -25,7 +25,6 @@ from sparserob_core.sip.convex_set import Array
 
 ORDER = 24  # of the law in time on a stretch; with a tenth of it stretches are a million times shorter
 LONG = 2.0  # the largest norm of a law times the length of a stretch or stride; ten times more exceeds `TERMS` terms
-SHORTER = 0.5  # the share of `LONG` that rescaled units aim at: a tenth doubles the digits lost, 1 takes more terms
 FIRST = 8  # stretches on the whole horizon of a law that changes with time, before any is halved
 SHORTEST = 2.0**-30  # of the horizon: where a shorter stretch would be needed, there is a pole as a rule
 
@@ -223,12 +222,10 @@ class Law:
             other, frame=frame, table=table, stride=min(other.stride, _round_up_to_power(other.stop - other.start))
         )
 
-    def _has_small_radii(self, radii: Array, rate: float, ratios: Array) -> bool:
-        """Return True where the radii ``(d, d + w)`` of a law are small next to its numbers, in the units of a stretch,
-        which are `units` times ``ratios (d,)``."""
+    def _has_small_radii(self, radii: Array, rate: float) -> bool:
+        """Return True where the radii ``(d, d + w)`` of a law are small next to its numbers."""
         d, u = self.plant.states, self.units
-        tolerance = SHARP * max(rate, pace(self._sampled_sizes[0], u))
-        is_small = pace(radii[:, :d], u) * ratios.max() <= tolerance
+        is_small = pace(radii[:, :d], u) <= SHARP * max(rate, pace(self._sampled_sizes[0], u))
         return bool(is_small and (radii[:, d:] <= SHARP * self._sampled_sizes[1]).all())
 
     def _divide_phase(self, begin: float, until: float, phase: Phase) -> list[Stretch]:
@@ -282,13 +279,12 @@ class Law:
             d, u = len(middle[0]), self.units
             size = bound_entries(middle[0])
             rate, length = pace(size[:, :d], u), float((stop - start) * OUTWARD)
-            ratios = np.ones(d) if rate * length <= LONG else _find_unit_factors(size[:, :d] * u / u[:, None] * length)
-            if ratios is None or not self._has_small_radii(_sum_radii(middle[0]), rate, ratios):
+            if not rate * length <= LONG or not self._has_small_radii(_sum_radii(middle[0]), rate):
                 return None
             table = middle if self.monomials.size == 1 else self._tabulate_law(start, stop, phase, self.monomials)[1]
         except Unchecked:
             return None
-        return Stretch(start, stop, Frame(self.monomials, ORDER), table, u * ratios)
+        return Stretch(start, stop, Frame(self.monomials, ORDER), table, u)
 
     def _tabulate_law(
         self, start: float, stop: float, phase: Phase, monomials: Monomials
@@ -311,15 +307,3 @@ class Law:
                         raise Unchecked("an entry of the system is not finite")
                     tables[k][i][j] = polynomial
         return frame, tables
-
-
-def _find_unit_factors(bounds: Array) -> Array | None:
-    """Return factors ``(d,)`` of the units of the states that make the system small enough, ``None`` where none are
-    found. It moves the states by at most ``M = bounds (d, d)``; with ``g = SHORTER LONG``, ``u = (1 - M / g)^-1 1``
-    satisfies ``M u <= g u`` where it is positive."""
-    relative = bounds / (SHORTER * LONG)
-    u = np.linalg.lstsq(np.eye(len(relative)) - relative, np.ones(len(relative)), rcond=None)[0]
-    if not (np.isfinite(u).all() and u.min() > 0.0):
-        return None
-    ratios = np.maximum(u, 1.0)
-    return np.asarray(ratios) if (bounds @ ratios <= LONG * ratios).all() else None
