@@ -56,6 +56,25 @@ def difference(a: Any, b: Any) -> tuple[Any, Any]:
     return nearest, (a - (nearest - negative_b)) - (b + negative_b)
 
 
+def rationals(rows: Iterable[Iterable[float | Fraction]]) -> fmpq_mat:
+    """Return rows of exact numbers as a matrix of fractions."""
+    return fmpq_mat([[fmpq(*x.as_integer_ratio()) for x in row] for row in rows])
+
+
+def is_semidefinite(matrix: fmpq_mat) -> bool:
+    """Return True where a matrix is symmetric and positive semidefinite, by elimination: no pivot is negative, and the
+    row of a zero pivot is zero."""
+    rows: list[list[fmpq]] = matrix.tolist()
+    for k, pivot_row in enumerate(rows):
+        pivot = pivot_row[k]
+        if pivot < 0 or (pivot == 0 and any(x != 0 for x in pivot_row[k:])):
+            return False
+        for row in rows[k + 1 :] if pivot != 0 else ():
+            share = row[k] / pivot
+            row[k:] = [a - share * b for a, b in zip(row[k:], pivot_row[k:], strict=True)]
+    return bool(matrix == matrix.transpose())
+
+
 def spanning(rows: Sequence[Sequence[fmpq]]) -> list[list[fmpq]]:
     """Return independent rows with the same span as the given rows."""
     if not rows:

@@ -30,30 +30,19 @@ class Monomials:
         return {e: i for i, e in enumerate(self.exponents)}
 
     @cached_property
-    def products(self) -> list[tuple[int, int, int]]:
-        """All ``(i, j, k)`` where monomial ``i`` times monomial ``j`` is monomial ``k``."""
-        return [
-            (i, j, self.number[tuple(a + b for a, b in zip(e, f, strict=True))])
-            for i, e in enumerate(self.exponents)
-            for j, f in enumerate(self.exponents)
-            if sum(e) + sum(f) <= self.degree
-        ]
-
-    @cached_property
     def products_with(self) -> list[list[tuple[int, int]]]:
         """For every monomial ``i``, all ``(j, k)`` where monomial ``i`` times monomial ``j`` is monomial ``k``."""
-        pairs: list[list[tuple[int, int]]] = [[] for _ in self.exponents]
-        for i, j, k in self.products:
-            pairs[i].append((j, k))
-        return pairs
+        sums = [[tuple(a + b for a, b in zip(e, f, strict=True)) for f in self.exponents] for e in self.exponents]
+        return [[(j, self.number[e]) for j, e in enumerate(row) if e in self.number] for row in sums]
 
     @cached_property
     def quotients(self) -> np.ndarray:
         """The table ``(size, size)`` of quotients: entry ``(i, k)`` is the ``j`` where monomial ``i`` times monomial
         ``j`` is monomial ``k``, and -1 where none is."""
         quotients = np.full((self.size, self.size), -1)
-        for i, j, k in self.products:
-            quotients[i, k] = j
+        for i, pairs in enumerate(self.products_with):
+            for j, k in pairs:
+                quotients[i, k] = j
         quotients.flags.writeable = False
         return quotients
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import add
 from typing import final
 
 import numpy as np
@@ -105,24 +106,6 @@ class Series:
         remainder = np.zeros((self.shape[0], other.shape[1]))
         return sum((self.sizes[i] @ tail_sums[i - 1] for i in range(1, len(self.sizes))), remainder) * OUTWARD
 
-    @cached_property
-    def _lifted(self) -> arb_mat:
-        """The matrix whose product with the `_column` of another series is the column of the product."""
-        (rows, columns), size = self.shape, self.monomials.size
-        table: list[list[arb | int]] = [[0] * (size * columns) for _ in range(size * rows)]
-        for part, pairs, is_nonzero in zip(self.parts, self.monomials.products_with, self.there, strict=True):
-            entries = part.tolist() if is_nonzero else []
-            for j, k in pairs if is_nonzero else ():
-                for row, values in enumerate(entries):
-                    table[k * rows + row][j * columns : (j + 1) * columns] = values
-        return arb_mat(table)
-
-    @cached_property
-    def _column(self) -> arb_mat:
-        """The coefficients, one above the other."""
-        (rows, columns), size = self.shape, self.monomials.size
-        return arb_mat(rows * size, columns, [x for part in self.parts for x in part.entries()])
-
     def within(self, off: Array) -> Series:
         """Return the series with larger radii: it contains every matrix that is within ``off (rows, columns)`` of this
         one at every parameter."""
@@ -182,24 +165,7 @@ def sizes_of(series: Sequence[Series]) -> Array:
 def dot(left: Sequence[Series], right: Sequence[Series]) -> Series:
     """Return the sum of the products of some series with others."""
     pairs = [(a, b) for a, b in zip(left, right, strict=True) if any(a.there)] or [(left[0], right[0])]
-    if left[0].monomials.size == 1:  # plain products are ten times as quick
-        total = pairs[0][0].parts[0] * pairs[0][1].parts[0]
-        for a, b in pairs[1:]:
-            total = total + a.parts[0] * b.parts[0]
-        return Series(left[0].monomials, [total])
-    if not all(all(a.there) for a, _ in pairs):
-        series = pairs[0][0] * pairs[0][1]
-        for a, b in pairs[1:]:
-            series = series + a * b
-        return series
-    column = pairs[0][0]._lifted * pairs[0][1]._column  # one product of matrices is quicker than many small ones
-    for a, b in pairs[1:]:
-        column = column + a._lifted * b._column
-    rows, columns, entries = left[0].shape[0], right[0].shape[1], column.entries()
-    count = rows * columns
-    parts = [arb_mat(rows, columns, entries[k : k + count]) for k in range(0, len(entries), count)]
-    remainder = sum((a._bound_beyond(b) for a, b in pairs), np.zeros((rows, columns)))
-    return Series(left[0].monomials, parts).within(remainder * OUTWARD)
+    return reduce(add, (a * b for a, b in pairs))
 
 
 def identity(count: int) -> arb_mat:

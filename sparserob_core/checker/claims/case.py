@@ -168,7 +168,7 @@ class Case:
     @cached_property
     def followed(self) -> FollowedRows:
         """The rows that are followed by their adjoints."""
-        return FollowedRows(self.problem, self.original_problem, self.timing, self.disturbances)
+        return FollowedRows(self.problem, self.timing, self.disturbances)
 
     @cached_property
     def sources(self) -> Sources:

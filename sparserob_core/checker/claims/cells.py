@@ -108,9 +108,9 @@ class BoxOfStates:
     clock: Clock
     added_terms: AddedTerms | None = None
 
-    def cells(self, interval: Interval, z: Array, sharp: bool) -> list[Polynomial]:
+    def cells(self, interval: Interval, z: Array) -> list[Polynomial]:
         """Return the polynomials of the rows ``z (k, b)`` on an interval, with the added terms of `added_terms`."""
-        polynomials = self.tube.cells(*interval, z, sharp)
+        polynomials = self.tube.cells(*interval, z)
         if self.added_terms is None:
             return polynomials
         return self.added_terms.added(polynomials, *interval[1:], z, within=(self.box, self.tube.flow))
@@ -157,7 +157,7 @@ def _examine(
     for interval, polynomials, tops in _bound_rows(place, sides.rows, todo):
         for i, row in enumerate(sides.rows):
             if not tops[i] <= 0.0:
-                tops[i], polynomials[i] = _tighten_bound(place, row, interval, polynomials[i], tops[i])
+                tops[i] = min(tops[i], _bound_by_halfspaces(place, row, polynomials[i]))
         for top, row in zip(tops, sides.rows, strict=True):
             if top <= 0.0:
                 shown.add(top, row)
@@ -177,18 +177,6 @@ def _examine(
             left.halves += _halve_interval(interval)
 
 
-def _tighten_bound(
-    place: BoxOfStates, row: Bounded, interval: Interval, poly: Polynomial, top: float
-) -> tuple[float, Polynomial]:
-    """Return a tighter bound with its polynomial: sharper where switching disturbances cause the error, and by the
-    half-spaces of the set of parameters."""
-    if poly.kinks > BLAME * row.slack:
-        ((_, (sharper,), (sharper_top,)),) = _bound_rows(place, [row], [interval], sharp=True)
-        if sharper_top < top:
-            top, poly = sharper_top, sharper
-    return (top if top <= 0.0 else min(top, _bound_by_halfspaces(place, row, poly))), poly
-
-
 def _has_too_wide_directions(
     place: BoxOfStates, sides: Sides, interval: Interval, failed: Sequence[tuple[Bounded, Polynomial]], worst: float
 ) -> bool:
@@ -201,7 +189,7 @@ def _has_too_wide_directions(
         return False
     ((_, (poly,), (top,)),) = _bound_rows(place, [middle], [interval])
     if not top <= 0.0:
-        top, poly = _tighten_bound(place, middle, interval, poly, top)
+        top = min(top, _bound_by_halfspaces(place, middle, poly))
     _refute(place, interval, [(middle, poly)])
     return sides.is_wide and top <= 0.0 and worst - top > 2.0 * (poly.expansion + poly.kinks)
 
@@ -216,14 +204,14 @@ def _refute(place: BoxOfStates, interval: Interval, rows: Sequence[tuple[Bounded
 
 
 def _bound_rows(
-    place: BoxOfStates, rows: Sequence[Bounded], todo: Sequence[Interval], sharp: bool = False
+    place: BoxOfStates, rows: Sequence[Bounded], todo: Sequence[Interval]
 ) -> Iterator[tuple[Interval, list[Polynomial], list[float]]]:
     """Yield every interval with its polynomials, one per row, and with proven upper bounds of their excess. Each bound
     holds for the polynomial with its error, less the limit and the slack of its row."""
     z, polynomials_by_interval = np.array([row.z for row in rows]), []
     for interval in todo:
         place.clock.check()
-        polynomials_by_interval.append(place.cells(interval, z, sharp))
+        polynomials_by_interval.append(place.cells(interval, z))
     tops = _bound_polynomials(
         place.tube,
         [

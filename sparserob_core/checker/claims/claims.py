@@ -179,15 +179,13 @@ def _verify_in_set(
     for k in places:
         case.clock.check()
         summands = parts(k)
-        deviation_support, point = (
-            None,
-            [sum(entries[1:], entries[0]) for entries in zip(*map(_extract_nominal, summands), strict=True)],
-        )
+        nominal_parts = ([row[0] for row in summand.tolist()] for summand in summands)
+        deviation_support, point = None, [sum(entries, ball(0)) for entries in zip(*nominal_parts, strict=True)]
         if any(not x.is_zero() for summand in summands for row in summand.tolist() for x in row[1:]):
             if shape.facets is None:
                 answering_pieces.append(k)
                 continue
-            responses = [_zero_nominal(summand) for summand in summands]
+            responses = [stacked([[ball(0), *row[1:]] for row in summand.tolist()]) for summand in summands]
             deviation_support = lambda c, responses=responses: feedback.heights(responses, exactly(c[None]))[0]  # noqa: E731
         over, where = excess(shape, point, deviation_support)
         if over > TOLERANCE:
@@ -217,16 +215,6 @@ def _bound_curved_excess(
             work.append((((), ()), Sides.cell(curved, low, high), [(k, times[k], times[k]) for k in places]))
     still = TimelessTube(heights, curved.normals)
     return max(0.0, prove(lambda _: still, Parameters(None), work, case.clock).share)
-
-
-def _extract_nominal(part: arb_mat) -> list[arb]:
-    """Return the nominal part ``(m,)``, the first column."""
-    return [row[0] for row in part.tolist()]
-
-
-def _zero_nominal(part: arb_mat) -> arb_mat:
-    """Return a part ``(m, 1 + Q)`` with 0 in place of its nominal column."""
-    return stacked([[row[0] * 0, *row[1:]] for row in part.tolist()])
 
 
 def _verify_repeat(case: Case, verdicts: Mapping[str, str]) -> str:

@@ -13,9 +13,9 @@ from itertools import groupby, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from flint import arb, fmpq, fmpq_mat
+from flint import arb
 
-from sparserob_core.checker.arithmetic.balls import balls, below
+from sparserob_core.checker.arithmetic.balls import balls, below, rationals
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.arithmetic.subdivision import fill
@@ -113,7 +113,7 @@ def normals_of(window: ConstraintWindow, data: object) -> Array:
     normals = numbers(data, "normals")
     if normals.shape != (b, d) or not np.array_equal(shape.lifted(normals[:, :b]), normals):
         raise Broken(f"normals: expected {b} directions of the first {b} of {d} states, or of their sums with others")
-    if fmpq_mat([[fmpq(*v.as_integer_ratio()) for v in row] for row in normals[:, :b].tolist()]).det() == 0:
+    if rationals(normals[:, :b].tolist()).det() == 0:
         raise Broken("normals: the directions lie in a plane")
     return normals
 

@@ -26,6 +26,7 @@ from sparserob_core.checker.reach.states import States
 from sparserob_core.checker.reach.tube import LoopTube, Polynomial, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import along, basis_of
+from sparserob_core.control.problem.disturbances import columns_of
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -253,20 +254,29 @@ def _read_deviations(case: Case, data: Mapping[str, Any]) -> tuple[Array | None,
 
 
 def _read_disturbance(case: Case, signal: object) -> Array:
-    """Return the disturbance ``(mw, pieces)``, shown to be admissible. Raise `Broken` where it leaves its set or jumps
-    within one of its pieces, `Unchecked` where its grid is another."""
-    changes, bound = case.disturbances.changes, case.problem.disturbance
-    assert changes is not None and bound is not None
+    """Return the disturbance ``(mw, pieces)``, shown to be admissible; raise `Unchecked` where its grid is another."""
+    bound = case.problem.disturbance
+    assert bound is not None
     w = numbers(signal, "disturbance")
     if w.ndim != 2 or w.shape[0] != bound.dimension:
         raise Broken(f"disturbance: expected {bound.dimension} rows, got shape {w.shape}")
     if w.shape[1] != len(case.timing.grid) - 1:
         raise Unchecked("the disturbance is given on another grid")
-    for k in range(w.shape[1]):
-        if k and ((w[:, k] != w[:, k - 1]) & ~case.disturbances.may_jump(case.timing.grid[k])).any():
-            raise Broken(f"the disturbance jumps at t = {case.timing.grid[k]:.6g}, within a piece")
-        if not known(bound).contains(w[:, k]):
-            raise Broken(
-                f"the disturbance {w[:, k].tolist()} at t = {case.timing.grid[k]:.6g} is not shown to be in its set"
-            )
+    require_admissible(case, w, case.timing.grid[:-1])
     return w
+
+
+def require_admissible(case: Case, signal: Array, starts: Sequence[float]) -> None:
+    """Raise `Broken` unless a disturbance ``(mw, M)``, whose values begin at ``starts (M,)``, jumps only where it may,
+    and is shown to be in its set."""
+    bound = case.problem.disturbance
+    assert bound is not None
+    is_held = ~columns_of(bound, case.problem.disturbance_class, "measurable")
+    for time, jumping in zip(starts[1:], ((signal[:, 1:] != signal[:, :-1]) & is_held[:, None]).T, strict=True):
+        if jumping.any() and (jumping & ~case.disturbances.may_jump(time)).any():
+            raise Broken(f"the disturbance jumps within a piece, at t = {time:.6g}")
+    shown_values = set[tuple[float, ...]]()
+    for time, value in zip(starts, case.clock.each(map(tuple, signal.T.tolist())), strict=True):
+        if value not in shown_values and not known(bound).contains(value):
+            raise Broken(f"the disturbance {list(value)} at t = {time:.6g} is not shown to be in its set")
+        shown_values.add(value)

@@ -23,7 +23,7 @@ from typing import final
 import numpy as np
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from sparserob_core.checker.arithmetic.balls import ball, largest, rational, spanning
+from sparserob_core.checker.arithmetic.balls import ball, largest, rational, rationals, spanning
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import exactly, identity, middles, stacked, zeros
 from sparserob_core.checker.cost.duality import ConstraintRow
@@ -189,7 +189,7 @@ def find_independent(loop: VerifiedLoop, vectors: Sequence[Sequence[Fraction]]) 
     effect that of all vectors follows. The third one, ``(r, q)``, gives the same effect along these ``r`` vectors. Of a
     system that changes with time, only the entries that may differ from 0 are known; then no vector is left out."""
     d, driven, q = loop.flow.states, loop.flow.driven, len(vectors)
-    along = fmpq_mat([[fmpq(v.numerator, v.denominator) for v in vector] for vector in vectors]).transpose()
+    along = rationals(vectors).transpose()
     modes = [] if loop.flow.plant.is_timed else modes_at(loop.system, ())
     if not modes or not all(x.is_exact() for mode in modes for name in "AE" for x in mode[name].entries()):
         is_nonzero = loop.flow.law.there
@@ -197,8 +197,8 @@ def find_independent(loop: VerifiedLoop, vectors: Sequence[Sequence[Fraction]]) 
         for _ in range(d):
             reached = reached | (is_nonzero[:, :d] @ reached)
         return np.flatnonzero(reached).tolist(), list(range(q)), identity(q)
-    systems = [_convert_to_rational(mode["A"].transpose()) for mode in modes]
-    effects = [_convert_to_rational(mode["E"]) * along for mode in modes]
+    systems = [rationals(middles(mode["A"].transpose()).tolist()) for mode in modes]
+    effects = [rationals(middles(mode["E"]).tolist()) * along for mode in modes]
     basis = spanning([row for effect in effects for row in effect.transpose().tolist()])
     for _ in range(d - 1 if basis else 0):
         basis = spanning([*basis, *(row for A in systems for row in (fmpq_mat(basis) * A).tolist())])
@@ -222,10 +222,6 @@ def _scale_rows(table: Array) -> Array:
 def _find_leads(rows: Sequence[Sequence[fmpq]]) -> list[int]:
     """Return the place of the first entry of every row that is not 0."""
     return [next(place for place, x in enumerate(row) if x != 0) for row in rows]
-
-
-def _convert_to_rational(matrix: arb_mat) -> fmpq_mat:
-    return fmpq_mat([[fmpq(*float(x).as_integer_ratio()) for x in row] for row in matrix.tolist()])
 
 
 def _stack_columns(segments: Sequence[tuple[Sequence[Fraction], arb]]) -> arb_mat:

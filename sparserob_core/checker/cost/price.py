@@ -12,9 +12,9 @@ from itertools import pairwise
 from typing import final
 
 import numpy as np
-from flint import arb, arb_mat, ctx, fmpq
+from flint import arb, arb_mat, ctx
 
-from sparserob_core.checker.arithmetic.balls import ball, balls, rational
+from sparserob_core.checker.arithmetic.balls import ball, balls, is_semidefinite, rational, rationals
 from sparserob_core.checker.arithmetic.series import norm, stacked
 from sparserob_core.checker.cost.nominal import NominalMotion, QuadraticTerms, evaluate_quadratic_terms, nominal_states
 from sparserob_core.checker.flow.flow import VerifiedFlow
@@ -51,11 +51,6 @@ class Price:
         default_factory=lambda: deque(maxlen=KEPT)
     )
     _motions_by_precision: dict[int, NominalMotion] = field(default_factory=dict)
-
-    @cached_property
-    def _piece_lengths(self) -> list[Fraction]:
-        ends = [Fraction(t) for t in self.clock.each(self.control.breakpoints.tolist())]
-        return [b - a for a, b in self.clock.each(pairwise(ends))]
 
     @property
     def is_quadratic(self) -> bool:
@@ -178,13 +173,13 @@ class Price:
     def convex(self) -> None:
         """Raise `Broken` unless every matrix of the cost is positive semidefinite."""
         for name, term in zip(("state", "control", "final"), self._quadratic_terms, strict=True):
-            if term is not None and not _is_semidefinite(term):
+            if term is not None and not is_semidefinite(rationals(term.Q.tolist())):
                 raise Broken(f"the matrix of the cost's {name} term is not positive semidefinite")
 
     @cached_property
     def _zero_control(self) -> list[arb_mat]:
         """The control that stays 0."""
-        return [stacked([[ball(0)]] * self.problem.system.controls)] * len(self._piece_lengths)
+        return [stacked([[ball(0)]] * self.problem.system.controls)] * self.control.pieces
 
     def _evaluate_quadratic(self, pieces: Sequence[arb_mat]) -> QuadraticTerms:
         """Return the quadratic terms and their slopes, at the working precision that they need; the latest are
@@ -204,20 +199,3 @@ class Price:
             bits *= 2
             if bits > MAX_BITS:
                 raise Unchecked("the quadratic cost cannot be resolved: the state grows too far over the horizon")
-
-
-def _is_semidefinite(term: Quadratic) -> bool:
-    """Return True where a matrix is positive semidefinite, by symmetric elimination in rational numbers: no pivot is
-    negative, and the row of a zero pivot is zero."""
-    exact = [[Fraction(float(entry)) for entry in row] for row in term.Q]
-    rows = [[fmpq(entry.numerator, entry.denominator) for entry in row] for row in exact]
-    if any(rows[i][j] != rows[j][i] for i in range(len(rows)) for j in range(i)):
-        return False
-    for k, row in enumerate(rows):
-        if row[k] < 0 or (row[k] == 0 and any(entry != 0 for entry in row[k + 1 :])):
-            return False
-        for i in range(k + 1, len(rows)):
-            if row[k] != 0 and rows[i][k] != 0:
-                factor = rows[i][k] / row[k]
-                rows[i] = [entry - factor * pivot_entry for entry, pivot_entry in zip(rows[i], row, strict=True)]
-    return True

@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import exactly
-from sparserob_core.checker.flow.flow import POINTS_KEPT, StateWeights, VerifiedFlow
+from sparserob_core.checker.flow.flow import StateWeights, VerifiedFlow
 from sparserob_core.checker.flow.law import Law, ParameterBox, bound_entries
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.segment import SHARP
@@ -48,15 +48,7 @@ class VerifiedFlows:
 
     def at(self, parameter: Sequence[float]) -> VerifiedFlow:
         """Return the flow at one parameter, of which there may be none."""
-        point = tuple(map(float, parameter))
-        box = ParameterBox(point, (0.0,) * len(point))
-        is_inside = self._wide_law is not None and self._wide_law.covers(box)
-        return self._follow_point(box) if is_inside else self._point_flow.at(point)
-
-    @remembered(lambda: POINTS_KEPT)
-    def _follow_point(self, box: ParameterBox) -> VerifiedFlow:
-        """Return the flow at the one parameter of a box, whose law is that over the box of all parameters."""
-        return VerifiedFlow(self.plant, self.until, box, 0, self._wide_law)
+        return self._point_flow.at(parameter)
 
     def weigh(self, c: Array, parameter: Sequence[float], grid: Sequence[float]) -> StateWeights:
         """Return the weights of ``c'x``, ``c (d,)``, at the end of a grid, which begins at 0, at one parameter."""
@@ -80,39 +72,12 @@ class VerifiedFlows:
         """Return the flow over a box, to a degree in the parameters; a degree of 0 is for systems without any."""
         if not degree:
             return self.at(())
-        return VerifiedFlow(self.plant, self.until, box, min(degree, self._flow_degree), self._wide_law or self.timing)
+        return VerifiedFlow(self.plant, self.until, box, degree, self.timing)
 
     @cached_property
     def timing(self) -> Law:
         """The law at a single parameter; the flows over all boxes use its stretches."""
         return self._point_flow.at(self.aside).law
-
-    @cached_property
-    def _wide_law(self) -> Law | None:
-        """The law over the box of all parameters, from which those of boxes and parameters inside follow; ``None``
-        where nothing changes with time or nothing is uncertain, or where the law is no polynomial of the degree."""
-        if not self.box.middle or not self.plant.is_timed:
-            return None
-        try:
-            law = Law(self.plant, self.until, self.box, WIDE.get(len(self.box.middle), 2), self.timing)
-            return law if law.is_sharp else None
-        except Unchecked:
-            return None
-
-    @cached_property
-    def _flow_degree(self) -> int:
-        """The degree of the flow as a polynomial in the parameters, where that is known, at least 1 and at most the
-        degree of the law's expansion: the states have degrees that no entry of the law raises any more."""
-        if self._wide_law is None:
-            return max(WIDE.values())
-        d, limit, degrees = self.plant.states, self._wide_law.degree, self._wide_law.degrees
-        states = degrees[:, d:].max(axis=1, initial=0)
-        while states.max() < limit:
-            raised = np.where(degrees[:, :d] < 0, 0, degrees[:, :d] + states).max(axis=1)
-            if (raised <= states).all():
-                break
-            states = np.maximum(states, raised)
-        return int(min(max(1, states.max()), limit))
 
     @property
     def aside(self) -> tuple[float, ...]:
@@ -156,7 +121,7 @@ class VerifiedFlows:
     def _choose_axis(self, box: ParameterBox) -> int:
         """Return the number of the parameter that changes the system most across a box."""
         try:
-            law = Law(self.plant, self.until, box, 1, self._wide_law or self.timing)
+            law = Law(self.plant, self.until, box, 1, self.timing)
             sizes = np.zeros(len(box.middle))
             for stretch in law.stretches:
                 u = law.units
@@ -171,7 +136,7 @@ class VerifiedFlows:
     def links(self) -> tuple[np.ndarray, np.ndarray]:
         """The entries of ``[A B c E]`` that may differ from 0 at some time and parameter, and the entries that may
         depend on the parameters: two Boolean arrays ``(d, d + w)``."""
-        law = Law(self.plant, self.until, self.box, min(1, self.degree), self._wide_law or self.timing)
+        law = Law(self.plant, self.until, self.box, min(1, self.degree), self.timing)
         is_dependent = []
         for stretch in law.stretches:
             constant, *higher = stretch.table

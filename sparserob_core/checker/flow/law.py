@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
-from itertools import pairwise, product
-from math import ceil, comb, floor, inf, log2
+from itertools import pairwise
+from math import ceil, floor, inf, log2
 from typing import final
 
 import numpy as np
@@ -25,7 +25,6 @@ from sparserob_core.sip.convex_set import Array
 
 ORDER = 24  # of the law in time on a stretch; with a tenth of it stretches are a million times shorter
 LONG = 2.0  # the largest norm of a law times the length of a stretch or stride; ten times more exceeds `TERMS` terms
-SHORTER = 0.5  # the share of `LONG` that rescaled units aim at: a tenth doubles the digits lost, 1 takes more terms
 FIRST = 8  # stretches on the whole horizon of a law that changes with time, before any is halved
 SHORTEST = 2.0**-30  # of the horizon: where a shorter stretch would be needed, there is a pole as a rule
 
@@ -156,8 +155,7 @@ def _truncate_powers(A: list[Series], units: Array) -> list[Series]:
 @dataclass(frozen=True, eq=False)
 class Law:
     """The law of a ``plant`` up to the time ``until`` over a ``box`` of parameters, to a ``degree`` in the parameters.
-    With a ``timing`` it has the stretches of that law. Where that law is sharp on a box around this one, it is this law
-    too: its polynomials in the parameters are moved to this box, and no entry is evaluated anew."""
+    With a ``timing`` it has the stretches of that law."""
 
     plant: Plant
     until: float
@@ -203,25 +201,10 @@ class Law:
             for stretch in self._divide_phase(begin, until, phase)
         ]
 
-    @property
-    def is_still(self) -> bool:
-        """True where every stretch `Stretch.is_still`."""
-        return all(stretch.is_still for stretch in self.stretches)
-
     @cached_property
     def there(self) -> np.ndarray:
         """The entries of ``[A B c E]`` that may differ from 0 at some time and parameter, Booleans ``(d, d + w)``."""
         return np.asarray(np.any([stretch.sizes[0] > 0.0 for stretch in self.stretches], axis=0))
-
-    @cached_property
-    def degrees(self) -> np.ndarray:
-        """The degree in the parameters of every entry of ``[A B c E]``, ``(d, d + w)``; -1 for an entry that is 0."""
-        degrees = np.full(self.there.shape, -1)
-        for stretch in self.stretches:
-            for degree, table in zip(self.monomials.degrees, stretch.table, strict=True):
-                is_nonzero = np.array([[entry.length() > 0 for entry in row] for row in table])
-                degrees = np.where(is_nonzero, np.maximum(degrees, degree), degrees)
-        return degrees
 
     @cached_property
     def weights(self) -> Array:
@@ -233,75 +216,16 @@ class Law:
 
     def _rebuild_stretch(self, other: Stretch) -> Stretch:
         """Return the law of this box on a stretch of the timing."""
-        if self.timing is not None and self.timing.covers(self.box):
-            return replace(other, frame=Frame(self.monomials, ORDER), table=self._recentre_table(self.timing, other))
         phase = next(phase for phase in reversed(self.plant.phases) if phase.begin <= other.start)
         frame, table = self._tabulate_law(other.start, other.stop, phase, self.monomials)
         return replace(
             other, frame=frame, table=table, stride=min(other.stride, _round_up_to_power(other.stop - other.start))
         )
 
-    def _recentre_table(self, wide: Law, stretch: Stretch) -> list[list[list[arb_poly]]]:
-        """Return the table of this box on a ``stretch`` of a law on a box around it. What is beyond the degree is in
-        the balls of the constant coefficient."""
-        around = arb(0, 1)
-        rows, columns = len(stretch.table[0]), len(stretch.table[0][0])
-        tables = [[[arb_poly([])] * columns for _ in range(rows)] for _ in range(self.monomials.size)]
-        for terms, outer in zip(self._expand_monomials(wide), stretch.table, strict=True):
-            entries = [(i, j, outer[i][j]) for i in range(rows) for j in range(columns) if outer[i][j].length()]
-            for number, factor in terms:
-                for i, j, entry in entries:
-                    moved = entry * factor
-                    if number is None:
-                        tables[0][i][j] += arb_poly([c * around for c in moved.coeffs()])
-                    else:
-                        tables[number][i][j] += moved
-        return tables
-
-    def _expand_monomials(self, wide: Law) -> list[list[tuple[int | None, arb]]]:
-        """Return every monomial of a law on a box around this one as a polynomial on this box: numbers of monomials
-        with their factors; ``None`` stands for a monomial beyond the degree."""
-        moves = []
-        for centre, half, middle, own in zip(
-            wide.box.middle, wide.box.halves, self.box.middle, self.box.halves, strict=True
-        ):
-            unit = arb(half) if half else arb(1)
-            moves.append(((arb(middle) - arb(centre)) / unit, arb(own) / unit))
-        expanded = list[list[tuple[int | None, arb]]]()
-        for e in wide.monomials.exponents:
-            terms = list[tuple[int | None, arb]]()
-            for f in product(*(range(n + 1) for n in e)):
-                factor = arb(1)
-                for n, k, (c, r) in zip(e, f, moves, strict=True):
-                    factor *= comb(n, k) * c ** (n - k) * r**k
-                if not factor.is_zero():
-                    constant = None if any(f) else 0
-                    terms.append((self.monomials.number.get(f) if self.degree else constant, factor))
-            expanded.append(terms)
-        return expanded
-
-    def covers(self, box: ParameterBox) -> bool:
-        """Return True where the law of a ``box`` follows from the polynomials of this law, without a loss."""
-        is_expanded = self.degree > 0 or not any(self.box.halves)  # to degree 0 it is the law in the middle alone
-        return is_expanded and self.box.holds(box) and self.is_sharp
-
-    @cached_property
-    def is_sharp(self) -> bool:
-        """True where all polynomials are known up to rounding, over the whole box, at every time."""
+    def _has_small_radii(self, radii: Array, rate: float) -> bool:
+        """Return True where the radii ``(d, d + w)`` of a law are small next to its numbers."""
         d, u = self.plant.states, self.units
-        for stretch in self.stretches:
-            radii = np.sum([_sum_radii(table) for table in stretch.table], axis=0)
-            rate = pace(bound_entries(stretch.table[0])[:, :d], u)
-            if not self._has_small_radii(radii, rate, stretch.units / u):
-                return False
-        return True
-
-    def _has_small_radii(self, radii: Array, rate: float, ratios: Array) -> bool:
-        """Return True where the radii ``(d, d + w)`` of a law are small next to its numbers, in the units of a stretch,
-        which are `units` times ``ratios (d,)``."""
-        d, u = self.plant.states, self.units
-        tolerance = SHARP * max(rate, pace(self._sampled_sizes[0], u))
-        is_small = pace(radii[:, :d], u) * ratios.max() <= tolerance
+        is_small = pace(radii[:, :d], u) <= SHARP * max(rate, pace(self._sampled_sizes[0], u))
         return bool(is_small and (radii[:, d:] <= SHARP * self._sampled_sizes[1]).all())
 
     def _divide_phase(self, begin: float, until: float, phase: Phase) -> list[Stretch]:
@@ -355,13 +279,12 @@ class Law:
             d, u = len(middle[0]), self.units
             size = bound_entries(middle[0])
             rate, length = pace(size[:, :d], u), float((stop - start) * OUTWARD)
-            ratios = np.ones(d) if rate * length <= LONG else _find_unit_factors(size[:, :d] * u / u[:, None] * length)
-            if ratios is None or not self._has_small_radii(_sum_radii(middle[0]), rate, ratios):
+            if not rate * length <= LONG or not self._has_small_radii(_sum_radii(middle[0]), rate):
                 return None
             table = middle if self.monomials.size == 1 else self._tabulate_law(start, stop, phase, self.monomials)[1]
         except Unchecked:
             return None
-        return Stretch(start, stop, Frame(self.monomials, ORDER), table, u * ratios)
+        return Stretch(start, stop, Frame(self.monomials, ORDER), table, u)
 
     def _tabulate_law(
         self, start: float, stop: float, phase: Phase, monomials: Monomials
@@ -384,15 +307,3 @@ class Law:
                         raise Unchecked("an entry of the system is not finite")
                     tables[k][i][j] = polynomial
         return frame, tables
-
-
-def _find_unit_factors(bounds: Array) -> Array | None:
-    """Return factors ``(d,)`` of the units of the states that make the system small enough, ``None`` where none are
-    found. It moves the states by at most ``M = bounds (d, d)``; with ``g = SHORTER LONG``, ``u = (1 - M / g)^-1 1``
-    satisfies ``M u <= g u`` where it is positive."""
-    relative = bounds / (SHORTER * LONG)
-    u = np.linalg.lstsq(np.eye(len(relative)) - relative, np.ones(len(relative)), rcond=None)[0]
-    if not (np.isfinite(u).all() and u.min() > 0.0):
-        return None
-    ratios = np.maximum(u, 1.0)
-    return np.asarray(ratios) if (bounds @ ratios <= LONG * ratios).all() else None

@@ -21,7 +21,6 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
 GOLDEN = 0.6180339887
-TERMS = 18  # of the power series of a transition in floats, at a norm of at most 1/2: further terms round away
 LOOKS = 17  # sample times of a phase; no claim rests on the samples
 POINT = Frame(NONE, 0)
 
@@ -85,16 +84,11 @@ def modes_at(system: System, parameter: Sequence[float]) -> list[dict[str, arb_m
 
 
 def held_about(A: Array, inputs: Array, time: float) -> tuple[Array, Array]:
-    """Return ``e^{A time}`` and ``int_0^time e^{A s} ds inputs`` in floats: a power series over a short time,
-    doubled."""
-    d, size = A.shape[0], float(np.abs(A).sum(axis=1).max(initial=0.0)) * time
-    halvings = max(0, int(np.ceil(np.log2(2.0 * size)))) if 0.0 < size < np.inf else 0
-    short = time / 2.0**halvings
-    flow, integral, term = np.eye(d), np.eye(d) * short, np.eye(d)
-    for order in range(1, TERMS + 1):
-        term = term @ A * (short / order)
-        flow, integral = flow + term, integral + term * (short / (order + 1))
-    integral = integral @ inputs
-    for _ in range(halvings):
-        flow, integral = flow @ flow, integral + flow @ integral
-    return flow, integral
+    """Return ``e^{A time}`` and ``int_0^time e^{A s} ds inputs`` in floats."""
+    from scipy.linalg import expm
+
+    d, columns = inputs.shape
+    whole = np.zeros((d + columns, d + columns))
+    whole[:d] = np.hstack([A, inputs]) * time
+    flow = expm(whole)[:d]
+    return flow[:, :d], flow[:, d:]

@@ -4,9 +4,7 @@ any units would be right."""
 from __future__ import annotations
 
 import numpy as np
-from flint import arb_mat
 
-from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.sip.convex_set import Array
 
 SWEEPS = 12  # of balancing
@@ -48,14 +46,3 @@ def balanced(A: Array, horizon: float, speed: Array) -> Array:
 def pace(rates: Array, units: Array) -> float:
     """Return the largest row sum of nonnegative ``rates (d, d)`` between states in these ``units (d,)``."""
     return float((rates * units / units[:, None]).sum(axis=1).max(initial=0.0))
-
-
-def scaled(matrix: arb_mat, rows: Array, columns: Array) -> arb_mat:
-    """Return a ball matrix with its rows and its columns multiplied by powers of two, which is exact."""
-    factors = list(map(float, columns))
-    return stacked(
-        [
-            [x * row * factor for x, factor in zip(line, factors, strict=True)]
-            for line, row in zip(matrix.tolist(), map(float, rows), strict=True)
-        ]
-    )

@@ -145,43 +145,6 @@ def _derive_coordinates(
     return coordinates, windows
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class RunningIntegrals:
-    """A problem with integrals, in which nothing changes with time but which coordinates are integrated.
-
-    In its ``system`` all coordinates are integrated all the time. The integral from ``begins (k,)`` to ``ends (k,)`` is
-    the coordinate at the end minus the coordinate at the beginning.
-    """
-
-    system: System
-    begins: Array
-    ends: Array
-
-    @staticmethod
-    def of(problem: OptimalControlProblem) -> RunningIntegrals | None:
-        """Return the running integrals of a problem as given by the user, with one known system; ``None`` for other
-        problems."""
-        system = problem.system
-        if not problem.integral or not system.is_constant or system.parameters is not None:
-            return None
-        coordinates, _ = _derive_coordinates(problem)
-        phase = _extend_phase(system.phases[0], [(coordinate.h, coordinate.g) for coordinate in coordinates])
-        windows = np.array([[coordinate.begin, coordinate.end] for coordinate in coordinates])
-        return RunningIntegrals(System((phase,), None, system.delay), *windows.T)
-
-    def parts(self, c: Array) -> list[tuple[Array, float]]:
-        """Return rows ``(d + k,)`` of that system, each with the time when it ends, which add up to a row ``c (d +
-        k,)``."""
-        d = c.size - self.begins.size
-        rows, ends = [(np.append(c[:d], np.zeros(self.begins.size)), np.inf)], np.stack([self.begins, self.ends])
-        for begin, end in np.unique(ends[:, c[d:] != 0.0], axis=1).T.tolist():
-            in_window = (self.begins == begin) & (self.ends == end)
-            row = np.append(np.zeros(d), np.where(in_window, c[d:], 0.0))
-            rows += [(row, end)] + ([(-row, begin)] if begin > 0.0 else [])
-        return [(row, until) for row, until in rows if row.any()] or rows[:1]
-
-
 def _extend_system(system: System, coordinates: list[Coordinate], horizon: float) -> System:
     """Return the system with its coordinates, divided where one of them begins or ends."""
     switches = [phase.begin for phase in system.phases[1:]]

@@ -19,7 +19,7 @@ from typing import final
 import numpy as np
 from flint import arb, arb_mat
 
-from sparserob_core.checker.arithmetic.balls import ball, largest, rational, smallest
+from sparserob_core.checker.arithmetic.balls import ball, is_semidefinite, largest, rational, rationals, smallest
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.stated.statement import StatedProgram
@@ -225,18 +225,13 @@ class Lagrangian:
 
 
 def _require_semidefinite(products: Mapping[tuple[int, int], Fraction]) -> None:
-    """Raise `Broken` where a sum of products of entries is negative somewhere, by elimination in fractions."""
+    """Raise `Broken` where a sum of products of entries is negative somewhere."""
     entries = sorted({i for key in products for i in key})
     if len(entries) > MAX_EXACT:
         raise Unchecked(f"products of more than {MAX_EXACT} entries, whose sum may be 0, are not shown to be convex")
     table = [[(1 + (i == j)) * products.get((min(i, j), max(i, j)), Fraction(0)) for j in entries] for i in entries]
-    for k, pivot_row in enumerate(table):
-        pivot = pivot_row[k]
-        if pivot < 0 or (pivot == 0 and any(pivot_row[k:])):
-            raise Broken("the objective is not convex")
-        for row in table[k + 1 :] if pivot else ():
-            share = row[k] / pivot
-            row[k:] = [a - share * b for a, b in zip(row[k:], pivot_row[k:], strict=True)]
+    if not is_semidefinite(rationals(table)):
+        raise Broken("the objective is not convex")
 
 
 def _choose_columns(matrix: Array, sizes: Array) -> list[int]:

@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from typing import TypeAlias
 
-from flint import fmpq, fmpq_mat
-
+from sparserob_core.checker.arithmetic.balls import rationals
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.sip.expressions.index_sets import Region
 
@@ -81,11 +80,7 @@ def _require_dimension(simplices: Sequence[Sequence[Point]], rows: Sequence[Row]
 
 def _rank(origin: Point, points: Sequence[Sequence[Fraction]]) -> int:
     """Return the number of independent directions from an origin to points."""
-    return _matrix([[a - b for a, b in zip(point, origin, strict=True)] for point in points]).rank()
-
-
-def _matrix(rows: Sequence[Sequence[Fraction]]) -> fmpq_mat:
-    return fmpq_mat([[fmpq(value.numerator, value.denominator) for value in row] for row in rows])
+    return rationals([[a - b for a, b in zip(point, origin, strict=True)] for point in points]).rank()
 
 
 def _is_opposite(facet: frozenset[Point], first: Point, second: Point) -> bool:
@@ -93,8 +88,8 @@ def _is_opposite(facet: frozenset[Point], first: Point, second: Point) -> bool:
     base, *others = sorted(facet)
     steps = [[a - b for a, b in zip(point, base, strict=True)] for point in (*others, first)]
     target = [a - b for a, b in zip(second, base, strict=True)]
-    columns = _matrix(steps).transpose()
+    columns = rationals(steps).transpose()
     normal = columns.transpose() * columns
-    right = columns.transpose() * _matrix([[value] for value in target])
+    right = columns.transpose() * rationals([[value] for value in target])
     share = normal.solve(right)[len(others), 0]
     return bool(share < 0)

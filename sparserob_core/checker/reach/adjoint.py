@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property
 from itertools import accumulate
 from math import ceil, factorial, floor, log2
-from operator import add
-from typing import NamedTuple, final
+from typing import final
 
 import numpy as np
-from flint import arb, arb_mat
+from flint import arb_mat
 
 from sparserob_core.checker.arithmetic.balls import ball, balls, difference
 from sparserob_core.checker.arithmetic.series import Series, middles, stacked, zeros
@@ -155,17 +154,6 @@ def choose_step(A: Array, horizon: float) -> float:
     return 2.0 ** floor(log2(min(horizon / 64.0, min(share, LONGEST) / size)))
 
 
-class AdjointSpan(NamedTuple):
-    """An adjoint ``row`` that meets a bounded input: at a time ``t``, what enters at ``s`` meets it at the age ``min(t,
-    until) - s``, or not at all where that is not between 0 and ``length``. The length may be off by ``rounded``. A
-    finite time ``until`` is before all times ``t``."""
-
-    row: AdjointRow
-    until: float = np.inf
-    length: float = np.inf
-    rounded: float = 0.0
-
-
 @final
 @dataclass(frozen=True, eq=False)
 class AdjointRow:
@@ -178,12 +166,7 @@ class AdjointRow:
     @staticmethod
     def of(motion: AdjointFlow, c: Array) -> AdjointRow:
         """Return the adjoint of a row ``c (d,)`` of exact numbers."""
-        return AdjointRow.of_balls(motion, [ball(v) for v in c])
-
-    @staticmethod
-    def of_balls(motion: AdjointFlow, c: list[arb]) -> AdjointRow:
-        """Return the adjoint of a row ``c (d,)`` of balls."""
-        rows, exponent, count = [c], floor(log2(motion.apart)), motion.count // motion.apart + 1
+        rows, exponent, count = [balls(c)], floor(log2(motion.apart)), motion.count // motion.apart + 1
         while len(rows) < BLOCK:
             rows += (stacked(rows) * motion.over(exponent)).tolist()
             exponent += 1
@@ -210,19 +193,9 @@ class AdjointRow:
         return self.motion.step
 
     @property
-    def single(self) -> AdjointRow:
-        """The row itself, which is known at all times."""
-        return self
-
-    @property
     def ends(self) -> Array:
         """The ends of the steps, 0 first, ``(N + 1,)``."""
         return np.asarray(np.arange(self.count + 1) * self.step)
-
-    @property
-    def spans(self) -> list[AdjointSpan]:
-        """The adjoints that a bounded input meets: this one, at any age."""
-        return [AdjointSpan(self)]
 
     def reversed(self) -> AdjointRow:
         """Return the adjoint of the row ``-c``."""
@@ -328,57 +301,6 @@ class AdjointRow:
         return bounds[:, :d], bounds[:, d : d + q], bounds[:, d + q :]
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class Stopped:
-    """A sum of adjoints, the ``parts``, each with a time from which it is constant. It replaces an `AdjointRow` at
-    single times."""
-
-    parts: Sequence[tuple[AdjointRow, float]]
-
-    @property
-    def single(self) -> AdjointRow:
-        """The one adjoint of the row, which a sum does not have."""
-        raise Unchecked("a sum of rows that stop is known at single times alone")
-
-    @property
-    def ends(self) -> Array:
-        """The ends of the steps, of which a sum has none."""
-        return np.zeros(0)
-
-    @cached_property
-    def spans(self) -> list[AdjointSpan]:
-        """The adjoints that a bounded input meets. For the integral of a row from ``a`` to ``b`` they are that of the
-        row over the length ``b - a``, and before ``a`` that of ``r(b - a) - r(0)``, where ``r(s)`` is the adjoint after
-        ``s``."""
-        (row, end), *further_parts = self.parts
-        if not further_parts:
-            return [AdjointSpan(row, end)]
-        (opposite, begin), *further_parts = further_parts
-        if further_parts or (row.nodes.mid[0] + opposite.nodes.mid[0]).any():
-            raise Unchecked("of measurable disturbances one integral at a time is followed")
-        exact = arb_mat([[arb(v) for v in row.nodes.mid[0].tolist()]])
-        change = exact * (self.motion.A * (arb(end) - arb(begin))).exp() - exact
-        length, rounded = difference(end, begin)
-        return [
-            AdjointSpan(row, end, length, abs(rounded)),
-            AdjointSpan(AdjointRow.of_balls(self.motion, change.tolist()[0]), begin),
-        ]
-
-    @property
-    def motion(self) -> AdjointFlow:
-        """The adjoint flow that all parts share."""
-        return self.parts[0][0].motion
-
-    def at(self, times: Array) -> Enclosed:
-        """Return the sum of the adjoints at exact ``times (k,)``, ``(k, d)``."""
-        return reduce(add, [row.at(np.minimum(times, until)) for row, until in self.parts])
-
-    def between(self, times: Array, start: Array | float, stop: Array | float) -> Enclosed:
-        """Return what an input of 1 from ``start`` to ``stop`` adds to the sum at exact times, ``(..., q)``."""
-        return reduce(add, [row.between(np.minimum(times, until), start, stop) for row, until in self.parts])
-
-
 def accumulate_exactly(values: Array) -> Array:
     """Return the sums of the first ``0, 1, ..., N`` of ``values (N, q)``, ``(N + 1, q)``: added in balls, each rounded
     to a float once."""
@@ -405,7 +327,7 @@ class Worst:
         the last inputs.
     """
 
-    adjoint: AdjointRow | Stopped
+    adjoint: AdjointRow
     centre: Array
     initial_set: ConvexSet | None
     grid: Array
@@ -465,7 +387,7 @@ class Worst:
     def _curvature_bounds(self) -> Array:
         """The upper bounds ``(N,)`` of the downward curvature of the largest value on every step. Times an eighth of
         the square of the width of a cell, they bound how far the largest value lies above its chord."""
-        states, once, twice = self.adjoint.single.derivative_bounds
+        states, once, twice = self.adjoint.derivative_bounds
         state_bound = np.abs(self.centre) + (
             0.0 if self.initial_set is None else np.array(known(self.initial_set).radius)
         )
@@ -477,7 +399,7 @@ class Worst:
             inputs[self._disturbance_columns] = known(self.disturbance_set).radius
         # an input on a piece has a difference of l'AF as second derivative: all together the total variation of l'AF,
         # and one value for the piece that acts
-        total = self.adjoint.single.step * float((twice @ inputs).sum()) + float((once @ inputs).max(initial=0.0))
+        total = self.adjoint.step * float((twice @ inputs).sum()) + float((once @ inputs).max(initial=0.0))
         return np.asarray((curvature + total) * OUTWARD)
 
     def over(self, start: Array, stop: Array, added_values: Array | float = 0.0) -> Array:
@@ -489,7 +411,7 @@ class Worst:
         tops = np.concatenate(bounds)[positions]
         width, curvature = (stop - start) * OUTWARD, np.zeros(start.size)
         if width.any():
-            step, last = self.adjoint.single.step, self.adjoint.single.count - 1
+            step, last = self.adjoint.step, self.adjoint.count - 1
             curvature = np.maximum(
                 *(self._curvature_bounds[np.clip((t / step).astype(int), 0, last)] for t in (start, stop))
             )
@@ -498,8 +420,7 @@ class Worst:
         return np.asarray(end_values.max(axis=0) + (width**2 / 8.0 * curvature + rounding_error) * OUTWARD)
 
     def cuts(self, more: Sequence[float]) -> Array:
-        """Return increasing times, among them ``more``, between which no input jumps. They are at most a step apart,
-        except for a `Stopped` adjoint, of which only values at single times are known."""
+        """Return increasing times, among them ``more``, between which no input jumps. They are at most a step apart."""
         times = [np.asarray(more, dtype=float), self.adjoint.ends]
         times += [self.grid] if self.drives.mid.any() or self.drives.rad.any() else []
         times += [self.changes] if self.disturbance_set is not None else []

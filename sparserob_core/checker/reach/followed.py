@@ -14,9 +14,8 @@ from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.flow import StateWeights
 from sparserob_core.checker.flow.plant import modes_at
 from sparserob_core.checker.problem.disturbances import Disturbances
-from sparserob_core.checker.problem.integrals import RunningIntegrals, spelt
 from sparserob_core.checker.problem.timing import Timing
-from sparserob_core.checker.reach.adjoint import AdjointFlow, AdjointRow, Stopped, Worst
+from sparserob_core.checker.reach.adjoint import AdjointFlow, AdjointRow, Worst
 from sparserob_core.checker.reach.states import Scene
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -34,27 +33,15 @@ MAX_PIECES = 4000
 @final
 @dataclass(frozen=True, eq=False)
 class FollowedRows:
-    """The rows of a ``problem`` that are computed by their adjoints, with the adjoints made so far.
-    ``original_problem`` is the problem as given by the user."""
+    """The rows of a ``problem`` that are computed by their adjoints, with the adjoints made so far."""
 
     problem: OptimalControlProblem
-    original_problem: OptimalControlProblem
     timing: Timing
     disturbances: Disturbances
 
-    @cached_property
-    def running(self) -> RunningIntegrals | None:
-        """The integrals that the problem bounds, where the system changes with time only because they begin and end;
-        else ``None``."""
-        # a constant system without parameters is divided by its integrals alone
-        return RunningIntegrals.of(spelt(self.original_problem)) if self.problem.system.switches else None
-
     @property
     def still(self) -> System | None:
-        """The one system that acts all the time, in which the bounded integrals run all the time too; ``None`` where
-        the system changes with time for another reason."""
-        if self.running is not None:
-            return self.running.system
+        """The one system that acts all the time; ``None`` where the system changes with time."""
         return self.problem.system if self.problem.system.is_constant else None
 
     @property
@@ -88,7 +75,7 @@ class FollowedRows:
         is_constant = problem.measurable is not None  # the middle of the set, and a bounded input beside it
         changes = [0.0] if is_constant else self.disturbances.changes or [0.0]
         return Worst(
-            self.choose_adjoint(c),
+            self.adjoint(c),
             np.asarray(problem.initial_state, dtype=float),
             problem.initial_set,
             np.array(self.timing.grid),
@@ -99,25 +86,15 @@ class FollowedRows:
 
     def weigh(self, c: Array, parameter: Sequence[float], grid: Sequence[float]) -> StateWeights:
         """Return the weights of ``c'x`` at the end of a grid, as `VerifiedFlows.weigh` does."""
-        row, time, m = self.choose_adjoint(c), np.array([grid[-1]]), self.problem.system.controls
+        row, time, m = self.adjoint(c), np.array([grid[-1]]), self.problem.system.controls
         effects, m = row.between(time, np.array(grid[:-1]), np.array(grid[1:])), m + self.problem.system.drifts
         pieces, columns = range(len(grid) - 1), (slice(m), slice(m, None))
         control, disturbance = ([effects[k : k + 1, part].matrix for k in pieces] for part in columns)
         return StateWeights(row.at(time).matrix, control, disturbance)
 
-    def choose_adjoint(self, c: Array) -> AdjointRow | Stopped:
-        """Return the adjoint of a row ``c (d,)``. An integral over a window is a sum of two rows, one that stops at the
-        end of the window and an opposite one that stops at its beginning."""
-        if self.running is not None:
-            terms = self.running.parts(c)
-            rows = [(self._remember_adjoint(row), until) for row, until in terms]
-            if len(terms) > 1 or terms[0][1] < np.inf:
-                return Stopped(rows)
-        return self._remember_adjoint(c)
-
     @remembered(key=lambda self, c: (c + 0.0).tobytes())  # -0 becomes 0, so that equal rows have equal bytes
-    def _remember_adjoint(self, c: Array) -> AdjointRow:
+    def adjoint(self, c: Array) -> AdjointRow:
         """Return the adjoint of a row ``c (d,)``, which is made once for the row and its opposite."""
         c, opposite = c + 0.0, 0.0 - c
         is_first = c.tobytes() <= opposite.tobytes()
-        return AdjointRow.of(self.flow, c) if is_first else self._remember_adjoint(opposite).reversed()
+        return AdjointRow.of(self.flow, c) if is_first else self.adjoint(opposite).reversed()

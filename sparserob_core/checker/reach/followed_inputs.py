@@ -18,14 +18,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.arithmetic.remembered import remembered
-from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.adjoint import (
-    ORDER,
-    AdjointRow,
-    AdjointSpan,
-    Stopped,
-    accumulate_exactly,
-)
+from sparserob_core.checker.reach.adjoint import ORDER, AdjointRow, accumulate_exactly
 from sparserob_core.checker.reach.bounded_inputs import SizedInput
 from sparserob_core.checker.reach.kernels import BoundedInputHere
 from sparserob_core.checker.sets.along import NormSummand
@@ -42,30 +35,22 @@ CENTRED = np.array([[comb(j, i) / 2.0**j for j in range(ORDER + 1)] for i in ran
 class FollowedInput(BoundedInputHere):
     """An ``input`` of a system with ``adjoints`` of exact rows ``(d,)``, of which it enters by some columns."""
 
-    adjoints: Callable[[Array], AdjointRow | Stopped]
+    adjoints: Callable[[Array], AdjointRow]
     input: SizedInput
 
     @remembered(key=lambda self, c: self.input.sort_direction(c))
-    def _integrate_along(self, c: Array) -> list[tuple[SupportIntegrals, AdjointSpan]]:
-        """Return the integrals of support functions for an exact direction ``c (d,)``, and what the input meets."""
-        spans = self.adjoints(self.input.reaching(c)).spans
-        return [(SupportIntegrals(span.row, self.input.columns, self.input.summands), span) for span in spans]
+    def _integrate_along(self, c: Array) -> SupportIntegrals:
+        """Return the integrals of support functions for an exact direction ``c (d,)``."""
+        return SupportIntegrals(self.adjoints(self.input.reaching(c)), self.input.columns, self.input.summands)
 
     def integrals(self, c: Array, times: Array, points: Array) -> tuple[Array, Array]:
         """Return lower and upper bounds ``(k, q, S)`` each of ``F(a)`` at the ages ``a = times (k,) - points (q,)``,
         and 0 where the age is not positive. The bounds hold for the exact differences of these times."""
-        bounds: Array = np.zeros((2, times.size * points.size, self.input.shares.size))
-        pairs = self._integrate_along(c)
-        for support_integrals, span in pairs:
-            if np.isfinite(span.until) and (times < span.until).any():
-                raise Unchecked("a row that stops is not followed before its end")
-            ages, rounded = (v.ravel() for v in difference(np.minimum(times, span.until)[:, None], points))
-            clipped = np.clip(ages, 0.0, span.length)
-            added = support_integrals.at(clipped, np.maximum(np.abs(rounded), span.rounded))
-            bounds += np.where(ages[:, None] > 0.0, added, 0.0)
-        error = (len(pairs) - 1) * HALF_ULP * np.abs(bounds).max(axis=0)
+        ages, rounded = (v.ravel() for v in difference(times[:, None], points))
+        bounds = self._integrate_along(c).at(np.maximum(ages, 0.0), np.abs(rounded))
+        low, high = np.where(ages[:, None] > 0.0, bounds, 0.0)
         shape = times.size, points.size, self.input.shares.size
-        return (bounds[0] - error).reshape(shape), (bounds[1] + error).reshape(shape)
+        return low.reshape(shape), high.reshape(shape)
 
     def least(self, c: Array, time: float) -> Array:
         """Return lower bounds ``(K, S)`` of what the worst input adds to ``c'x(t)``, for a command of size 1 on one
@@ -98,7 +83,7 @@ class FollowedInput(BoundedInputHere):
         if not (start < stop).any():
             return np.zeros(start.size)
         indices, change, errors = self.jumps
-        row = self.adjoints(self.input.reaching(c)).single
+        row = self.adjoints(self.input.reaching(c))
         steepest = row.derivative_bounds[1][:, self.input.columns] @ self.input.radii.T * OUTWARD
         ages = np.stack([start, stop])[:, :, None] - self.input.breakpoints[indices]
         places = np.clip(np.floor(ages / row.step).astype(int) + np.array([-1, 1])[:, None, None], 0, row.count - 1)

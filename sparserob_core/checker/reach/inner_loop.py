@@ -18,6 +18,7 @@ from flint import arb, arb_mat
 from sparserob_core.checker.arithmetic.balls import above, ball, balls
 from sparserob_core.checker.arithmetic.series import exactly, identity, middles, stacked, zeros
 from sparserob_core.checker.flow.flow import VerifiedFlow
+from sparserob_core.checker.flow.plant import held_about
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 GROWTHS = 3.0  # times the growth of a plant whose digits are kept: with half of them bounds are as wide as the numbers
@@ -316,7 +317,7 @@ def lost_digits(
     """
     if not gains.size:
         return 0.0
-    steps = [[_step(A, B, length) for A, B in plants] for length in lengths]
+    steps = [[held_about(A, B, length) for A, B in plants] for length in lengths]
     exponent = _wrap([[Phi + Gamma @ K for Phi, Gamma in step] for step, K in zip(steps, gains, strict=True)])
     exponent += _wrap([[Phi - LC for Phi, _ in step] for step, LC in zip(steps, corrections, strict=False)])
     rates = [float(np.linalg.eigvals(A).real.max()) for A, _ in plants]
@@ -332,17 +333,6 @@ def _wrap(steps: Sequence[Sequence[Array]]) -> float:
         sizes = max((np.abs(mode) @ wrapped for mode in modes), key=np.sum)
         exponent, wrapped = exponent + max(0.0, float(np.log(sizes.max()))), sizes / sizes.max()
     return exponent
-
-
-def _step(A: Array, B: Array, length: float) -> tuple[Array, Array]:
-    """Return the transition of the state ``(d, d)`` over a piece, and its response to a control ``(d, m)``."""
-    from scipy.linalg import expm
-
-    d, m = B.shape
-    whole = np.zeros((d + m, d + m))
-    whole[:d] = np.hstack([A, B]) * length
-    flow = expm(whole)[:d]
-    return flow[:, :d], flow[:, d:]
 
 
 def _part_modes(Phi: Array) -> Array:

@@ -55,7 +55,7 @@ class Sources:
         if self.flows.box.middle:
             return BoundedInputOver(self.flows, entering)
         if self.followed.still is not None:
-            return FollowedInput(self.followed.choose_adjoint, entering)
+            return FollowedInput(self.followed.adjoint, entering)
         return BoundedInputAt(self.flows.at(()), entering)
 
     def measurable_input_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:

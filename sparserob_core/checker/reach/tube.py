@@ -21,7 +21,7 @@ from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.states import States
 from sparserob_core.checker.sets.known import known
-from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING, Enclosed, lengths, rounding
+from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING, Enclosed, rounding
 from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -132,10 +132,9 @@ class VerifiedTube:
             table.append(row)
         return Enclosed.of(stacked(table))
 
-    def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
+    def cells(self, piece: int, start: float, stop: float, z: Array) -> list[Polynomial]:
         """Return polynomials near the largest ``c'x`` over all deviations, for every direction ``c = z_i'basis``, ``z
-        (k, b)``, on a cell of time, a part of a piece of the grid without marks. Where it is ``sharp``, the error due
-        to disturbances that switch is smaller, if the set is round; this takes longer."""
+        (k, b)``, on a cell of time, a part of a piece of the grid without marks."""
         states = self.rows.states
         interval = states.place(piece, start)
         state, effects = self.rows.on(interval, start, stop)
@@ -145,9 +144,7 @@ class VerifiedTube:
         rad, kinks, turning = np.abs(z) @ errors.sum(axis=(0, 1)), np.zeros(len(z)), np.zeros(len(z))
         for convex, effect in effects:
             arguments = self._recentre(effect, 2)
-            supports, support_errors, switching, of_box = bound_supports(
-                known(convex), self.flow.monomials, arguments.mid, arguments.rad, z, sharp
-            )
+            supports, support_errors, switching, of_box = bound_supports(known(convex), arguments.mid, arguments.rad, z)
             rad += support_errors + rounding(1) * (np.abs(mid) + np.abs(supports)).sum(axis=(1, 2))
             mid, kinks, turning = mid + supports, kinks + switching, turning + of_box
         blur = np.abs(z) @ (np.abs(self.rows.basis) @ states.blur(interval))
@@ -166,58 +163,27 @@ class VerifiedTube:
         return Enclosed(np.moveaxis(mid @ moves.mid.T, -1, axis), np.moveaxis(errors * OUTWARD, -1, axis))
 
 
-def bound_supports(
-    shape: Shape, monomials: Monomials, every: Array, errors: Array, z: Array, sharp: bool
-) -> tuple[Array, Array, Array, Array]:
+def bound_supports(shape: Shape, every: Array, errors: Array, z: Array) -> tuple[Array, Array, Array, Array]:
     """Return polynomials that, with their errors, are upper bounds of the sum over pieces of a set's support function,
-    smaller where ``sharp``. The arguments are combinations ``z (k, b)`` of ``every (pieces, J + 1, M, mw, b)`` with
-    ``errors``.
+    by a point of the set that is best or nearly so in the middle of the range of the arguments. These are combinations
+    ``z (k, b)`` of ``every (pieces, J + 1, M, mw, b)`` with ``errors``.
 
     They are coefficients ``(k, J + 1, M)`` and their errors ``(k,)``. The third value says how much they may be too
     large because the worst point of the set switches, ``(k,)``, the last about how much of that is due to the box of
     parameters."""
-    pieces = every.shape[0]
-    mid, w, argument_errors, error, kinks, share = _bound_linearly(shape, every, errors, z, pieces)
-    k, mw = mid.shape[0], mid.shape[-1]
-    if not sharp or shape.norm is None or shape.norm.q != 2.0:
-        coefficients = np.einsum("ilw,iljkw->ijk", w, mid)
-        return coefficients, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
-    # for every piece, the better one of this linear bound and a polynomial above the length of L'f
-    m, L = shape.centre, shape.norm.outer
-    transformed = (mid @ L).reshape(-1, *mid.shape[2:4], L.shape[1])
-    above, above_errors, over = (
-        values.reshape(k, pieces, *values.shape[1:]) for values in lengths(monomials, transformed)
-    )
-    transformed_errors = (argument_errors + rounding(mw) * np.abs(mid).sum(axis=(2, 3))) @ np.abs(L)
-    above_errors = above_errors + np.linalg.norm(transformed_errors, axis=2) + argument_errors @ np.abs(m)
-    above_errors = (above_errors + rounding(pieces) * np.abs(above).sum(axis=(2, 3))) * OUTWARD
-    better = above_errors < error
-    linear = np.einsum("ilw,iljkw->iljk", w, mid)
-    coefficients = np.where(better[:, :, None, None], above + mid @ m, linear).sum(axis=1)
-    error, kinks = np.where(better, above_errors, error), np.where(better, over, kinks)
-    return coefficients, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
-
-
-def _bound_linearly(
-    shape: Shape, every: Array, errors: Array, z: Array, count: int
-) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Return linear upper bounds of the support function of each piece, by a point of the set that is best or nearly so
-    in the middle of the range of the arguments.
-
-    They are the arguments ``(k, pieces, J + 1, M, mw)``; the points and the errors of the arguments, ``(k, pieces,
-    mw)``, where up to ``count`` pieces are added up. Then follow the errors of the bounds, ``(k, pieces)``, their parts
-    due to switching, and the share of these that is due to the box of parameters."""
     mid = np.einsum("ljkwb,ib->iljkw", every, z)
     rad = np.einsum("ljkwb,ib->iljkw", errors + rounding(z.shape[1]) * np.abs(every), np.abs(z)) * OUTWARD
     k, pieces, mw = mid.shape[0], mid.shape[1], mid.shape[-1]
     value, spread, of_box = _compute_ranges(mid, rad)
     w, excess = shape.bound(value.reshape(-1, mw), spread.reshape(-1, mw))
     w, kinks = w.reshape(k, pieces, mw), excess.reshape(k, pieces) * OUTWARD
-    argument_errors = rad.sum(axis=(2, 3)) + rounding(count * mw) * np.abs(mid).sum(axis=(2, 3))
+    argument_errors = rad.sum(axis=(2, 3)) + rounding(pieces * mw) * np.abs(mid).sum(axis=(2, 3))
     radius = np.array(shape.radius)
     total_width, box_width = spread @ radius, of_box @ radius
     share = np.divide(box_width, total_width, out=np.zeros_like(total_width), where=total_width > 0.0)
-    return mid, w, argument_errors, np.einsum("ilw,ilw->il", np.abs(w), argument_errors) * OUTWARD + kinks, kinks, share
+    error = np.einsum("ilw,ilw->il", np.abs(w), argument_errors) * OUTWARD + kinks
+    coefficients = np.einsum("ilw,iljkw->ijk", w, mid)
+    return coefficients, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
 
 
 def _compute_ranges(mid: Array, rad: Array) -> tuple[Array, Array, Array]:
@@ -242,7 +208,7 @@ class LoopTube:
     gains: Array
     flow: Around = Around()  # noqa: RUF009  immutable
 
-    def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
+    def cells(self, piece: int, start: float, stop: float, z: Array) -> list[Polynomial]:
         """Return chords with error bounds for every direction ``c = z_i'basis``, with the parameters of
         `VerifiedTube.cells`. The part ``expansion`` of the error is due to the length of the cell. The true value may
         be far below a chord between its ends."""
@@ -276,7 +242,7 @@ class TimelessTube:
     basis: Array
     flow: Around = Around()  # noqa: RUF009  immutable
 
-    def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
+    def cells(self, piece: int, start: float, stop: float, z: Array) -> list[Polynomial]:
         """Return constants with error bounds at the place number ``piece``, with the parameters of
         `VerifiedTube.cells`."""
         heights = _convert_balls(self.heights(piece, exactly(_combine_rows(z, self.basis))))

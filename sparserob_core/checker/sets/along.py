@@ -38,11 +38,6 @@ class Norm(NamedTuple):
     share: float
     q: float
 
-    @property
-    def outer(self) -> Array:
-        """A matrix that gives no smaller norms."""
-        return np.asarray(self.L * (np.nextafter(1.0 + self.share, np.inf) * OUTWARD))
-
 
 @final
 @dataclass(frozen=True, eq=False)

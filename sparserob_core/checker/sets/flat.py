@@ -13,7 +13,17 @@ from typing import final
 import numpy as np
 from flint import arb, fmpq, fmpq_mat
 
-from sparserob_core.checker.arithmetic.balls import above, ball, balls, below, largest, rational, smallest, spanning
+from sparserob_core.checker.arithmetic.balls import (
+    above,
+    ball,
+    balls,
+    below,
+    largest,
+    rational,
+    rationals,
+    smallest,
+    spanning,
+)
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.along import NormSummand
@@ -147,9 +157,7 @@ class Cornered(Flat):
         """The vectors from the first corner to others, each with the number 1; ``None`` for a set that is not thin. The
         lines between corners lie in the set."""
         chosen = _select_distant_rows(self._offsets)
-        if len(chosen) == self.dimension or (
-            len(chosen) > 1 and len(_select_independent_rows(self._offsets)) > len(chosen)
-        ):
+        if len(chosen) == self.dimension or (len(chosen) > 1 and rationals(self._offsets).rank() > len(chosen)):
             return None
         return [(vector, Fraction(1)) for vector in chosen]
 
@@ -278,7 +286,7 @@ class Segments(Flat):
         """The exact normals, one for each pair of facets: the normals within the span of the segments, and some that
         span its orthogonal complement."""
         d, normals = self.dimension, dict[tuple[str, ...], list[fmpq]]()
-        rows = [[fmpq(*v.as_integer_ratio()) for v in g] for g in self.source.generators.tolist() if any(g)]
+        rows = [row for row in rationals(self.source.generators.tolist()).tolist() if any(row)]
         complement = _compute_null_space(rows, d)
         rank = d - len(complement)
         spanning_sets = [[*vectors, *complement] for vectors in combinations(rows, rank - 1)] if rank else []
@@ -302,7 +310,7 @@ class Segments(Flat):
     def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
         """The longest of the segments whose sum the set is, as many as have distinct directions."""
         chosen = _select_distant_rows(self._merged_segments)
-        if len(chosen) == self.dimension or len(_select_independent_rows(self._merged_segments)) > len(chosen):
+        if len(chosen) == self.dimension or rationals(self._merged_segments).rank() > len(chosen):
             return None
         return [(vector, Fraction(2)) for vector in chosen]
 
@@ -424,21 +432,6 @@ def _select_distant_rows(
     return chosen
 
 
-def _select_independent_rows(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
-    """Return the rows that are not a linear combination of the rows before them."""
-    chosen, reduced = list[list[Fraction]](), list[tuple[int, list[Fraction]]]()
-    for row in rows:
-        residual = row
-        for lead, pivot_row in reduced:
-            residual = [a - residual[lead] * b for a, b in zip(residual, pivot_row, strict=True)]
-        indices = [i for i, v in enumerate(residual) if v]
-        if indices:
-            lead = indices[0]
-            reduced.append((lead, [v / residual[lead] for v in residual]))
-            chosen.append(row)
-    return chosen
-
-
 def _compute_null_space(rows: Sequence[Sequence[fmpq]], d: int) -> list[list[fmpq]]:
     """Return vectors ``(d,)`` that span the orthogonal complement of the rows."""
     basis = spanning(rows)
@@ -471,7 +464,7 @@ def _find_intersections(
     d = len(rows[0]) - 1
     if comb(len(rows) + len(planes), d) > MAX_CORNERS:
         raise Unchecked(f"a polytope with {len(rows)} facets in {d} dimensions has too many corners to be listed")
-    exact = [[fmpq(*Fraction(x).as_integer_ratio()) for x in row] for row in rows]
+    exact = rationals(rows).tolist()
     walls = exact + [[fmpq(int(i == plane)) for i in range(d)] + [fmpq(0)] for plane in planes]
     points: set[tuple[Fraction, ...]] = set()
     for chosen in combinations(walls, d):

@@ -17,14 +17,13 @@ from sparserob_core.checker.claims.claims import judged, precision_of
 from sparserob_core.checker.claims.constraints import covered, cut_times, prove_on_cells
 from sparserob_core.checker.claims.followed import FollowedRow
 from sparserob_core.checker.claims.multipliers import admissible
-from sparserob_core.checker.claims.replay import compute_value
+from sparserob_core.checker.claims.replay import compute_value, require_admissible
 from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.outcome import FIGURES, TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD
 from sparserob_core.checker.sets.shape import basis_of
 from sparserob_core.checker.sets.sides import Bounded, Sides
-from sparserob_core.control.problem.disturbances import columns_of
 from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.sip.convex_set import Array
 
@@ -193,16 +192,7 @@ def _read_signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | N
             raise Broken("a disturbance is written, there is none")
         return changes, None
     signal = shaped(entry, "disturbance", (problem.disturbance.dimension, changes.size - 1))
-    is_held = ~columns_of(problem.disturbance, problem.disturbance_class, "measurable")
-    jumps = (signal[:, 1:] != signal[:, :-1]) & is_held[:, None]
-    for time, jumping in zip(changes[1:-1].tolist(), jumps.T, strict=True):
-        if (jumping & ~case.disturbances.may_jump(time)).any():
-            raise Broken("the disturbance jumps within a piece")
-    shape, shown_values = known(problem.disturbance), set[tuple[float, ...]]()
-    for value in case.clock.each(map(tuple, signal.T.tolist())):
-        if value not in shown_values and not shape.contains(value):
-            raise Broken(f"the disturbance {list(value)} is not shown to be in its set")
-        shown_values.add(value)
+    require_admissible(case, signal, changes[:-1].tolist())
     return changes, signal
 
 

@@ -115,7 +115,7 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
             moved(case_of(), control=FINE, disturbance=sr.Dictionary.indicators([0.0, 1.0, 2.0])), [[0.1, 0.2, 0.2]]
         ),
         Broken,
-        "jumps at t = 0.5, within a piece",
+        "jumps within a piece, at t = 0.5",
     ),
     "a disturbance on another grid": (
         lambda: replay._read_disturbance(case_of(), [[0.1]]),

@@ -16,14 +16,12 @@ from sparserob_core.checker.claims import cells, claims, constraints, replay, un
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.cost.duality import ConstraintRow, Duality
 from sparserob_core.checker.flow.flows import VerifiedFlows
-from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach import followed as followed_rows
 from sparserob_core.checker.reach.bounded_inputs import BoundedInputAt
-from sparserob_core.checker.reach.followed import FollowedRows
 from sparserob_core.checker.reach.followed_inputs import FollowedInput
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.control.problem.system import VaryingSystem
-from sparserob_core.control.problem.terms.integral import IntegralConstraint
 from sparserob_core.control.sets.sets import Box
 from tests.support.worst_cases import (
     BEFORE,
@@ -187,51 +185,6 @@ def test_a_violation_along_rows_is_the_one_of_the_tube(which: str, monkeypatch: 
                 found.append(over)
                 assert slack < 1e-7
             assert found[1] == pytest.approx(found[0], abs=1e-12)
-
-
-@pytest.mark.slow
-def test_an_integral_that_begins_later_is_the_one_of_pieces_where_rows_are_followed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Of its worst case, of that from one state, and of what multipliers speak of."""
-    made = replace(kind("known"), begun=Box([-0.1, -0.05], [0.15, 0.1]))
-    rows = {"H": [[1.0, -0.5], [0.3, 0.0]], "G": [[0.2, -0.1], [0.0, 0.0]]}
-    entries = [IntegralConstraint(**rows, upper=[1.0, 2.0], lower=[-1.0, -np.inf], start=0.4, stop=1.3)]
-    case = made.case(path=[], integral=entries)
-    (window,), found = case.windows, list[list[float]]()
-    said = {"constraint": window.name, "time": window.start, "violation": 0.0}
-    c, begun = np.array([0.3, -0.1, 1.0, -2.0]), np.append(np.array(START) + np.array([0.1, -0.05]), [0.0, 0.0])
-    for followed in (100, 1):
-        monkeypatch.setattr(followed_rows, "FOLLOWED", followed)
-        assert case.followed.are_best == (followed == 1)
-        numbers = [x for state in (None, begun) for x in replay.exceeded(case, said, state)[0]]
-        row = case.duality.row(c, window.start, [], arb(0.25), disturbed=True)
-        found.append(numbers + [float(x.mid()) for part in ([row.constant], *row.slope) for x in part])
-    assert found[1] == pytest.approx(found[0], abs=1e-12)
-    assert len(set(np.round(found[0], 6))) > 6  # of other states, rows and pieces others
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("start", [0.0, 0.4])
-def test_measurable_disturbances_of_an_integral_are_those_of_pieces(
-    start: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = replace(kind("known"), begun=Box([-0.1, -0.05], [0.15, 0.1]))
-    other = {"H": [[0.0, 1.0]], "G": [[0.1, 0.0]], "upper": [1.0], "lower": [-1.0], "start": 1.5, "stop": 1.8}
-    entry = IntegralConstraint(H=[[1.0, -0.5]], G=[[0.2, -0.1]], upper=[1.0], lower=[-2.0], start=start, stop=1.3)
-    entries = [entry, IntegralConstraint(**other)]
-    case = made.case(path=[], integral=entries, disturbance_class="measurable")
-    window, found = case.windows[0], list[list[float]]()
-    assert case.followed.are_best  # whatever its number of states, as all of measurable disturbances are
-    for is_followed in (False, True):
-        monkeypatch.setattr(FollowedRows, "are_best", is_followed)
-        said = {"constraint": window.name, "time": window.start, "violation": 0.0}
-        over, slack = replay.exceeded(case, said)
-        found.append(over)
-        assert slack < 1e-7
-    assert found[1] == pytest.approx(found[0], abs=1e-9)
-    with pytest.raises(Unchecked, match="one integral at a time"):
-        case.sources.measurable_input_at([]).added(np.array([0.0, 0.0, 1.0, 1.0]), 1.8)
 
 
 def test_a_quadratic_cost_of_a_system_in_time_is_an_integral_by_hand() -> None:

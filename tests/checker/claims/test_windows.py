@@ -17,7 +17,7 @@ import pytest
 from flint import arb, ctx
 
 import sparserob_core as sr
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import balls, is_semidefinite, rationals
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.claims import claims, constraints, multipliers, replay
@@ -25,7 +25,6 @@ from sparserob_core.checker.claims.case import Case, numbers
 from sparserob_core.checker.claims.causal import _share_peak_price, causal_bound
 from sparserob_core.checker.claims.cells import BoxOfStates, _bound_by_halfspaces
 from sparserob_core.checker.claims.units import units_of
-from sparserob_core.checker.cost.price import _is_semidefinite
 from sparserob_core.checker.outcome import RESOLVED, Broken, Clock, Finding, Unchecked
 from sparserob_core.checker.reach import followed as followed_rows
 from sparserob_core.checker.reach.tube import Polynomial
@@ -33,7 +32,6 @@ from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters
 from sparserob_core.checker.sets.sides import Bounded
 from sparserob_core.control.policies.affine import AffinePolicy
-from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.polytope import Polytope
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall
@@ -606,7 +604,7 @@ def test_a_matrix_is_positive_semidefinite_in_rational_numbers():
         ([[4.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 0.0]], True),
         ([[4.0, 2.0, 1.0], [2.0, 1.0, 0.0], [1.0, 0.0, 9.0]], False),
     ):
-        assert _is_semidefinite(Quadratic(np.array(Q), np.zeros(len(Q)))) is well
+        assert is_semidefinite(rationals(Q)) is well
 
 
 def test_the_unit_of_a_row_is_the_smallest_of_its_width_its_limit_and_how_far_it_can_reach():

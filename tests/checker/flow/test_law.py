@@ -220,56 +220,6 @@ def test_stretches_of_boxes_are_those_of_a_timing() -> None:
     assert len(own.stretches) > len(law.stretches)
 
 
-def in_parameters(text: str, *degree: int) -> tuple[Plant, Law]:
-    """A plant with the entry ``text`` in ``p`` from -0.3 to 0.5 and ``q`` from 1 to 2, and its law on this box."""
-    system = VaryingSystem.of(
-        [[text]], [["q*t"]], 2.0, [[1]], parameters=sr.Box([-0.3, 1.0], [0.5, 2.0]), names=["p", "q"]
-    )
-    plant, whole = Plant.of(system, 2.0), ParameterBox.between([-0.3, 1.0], [0.5, 2.0])
-    return plant, Law(plant, 2.0, whole, *degree, Law(plant, 2.0, ParameterBox((0.2, 1.2), (0.0, 0.0))))
-
-
-CUBIC = "p^3*cos(t) - 2*p*q^2 + exp(t)"
-
-
-@pytest.mark.parametrize(
-    ("box", "degree", "near"),
-    [(ParameterBox((0.35, 1.75), (0.0, 0.0)), 0, 1e-25), (ParameterBox((0.3, 1.5), (0.2, 0.5)), 3, 1e-25),
-     (ParameterBox((0.3, 1.9), (0.1, 0.0)), 3, 1e-25), (ParameterBox((0.45, 1.5), (0.05, 0.25)), 1, 0.6)],
-    ids=["point", "box", "edge", "linear"],
-)  # fmt: skip
-def test_the_law_of_a_box_follows_from_a_sharp_one_around_it(box, degree, near, monkeypatch) -> None:
-    plant, wide = in_parameters(CUBIC, 3)
-    assert wide.covers(box) and wide.stretches
-    monkeypatch.setattr(laws, "called", lambda *_: pytest.fail("the entries were evaluated anew"))
-    law = Law(plant, 2.0, box, degree, wide)
-
-    def entries(t: float, parameter: np.ndarray) -> list[list[float]]:
-        p, q = parameter
-        return [[p**3 * np.cos(t) - 2 * p * q**2 + np.exp(t), q * t, 1.0]]
-
-    holds(law, [(-1.0, -1.0), (1.0, 1.0), (-0.5, 1.0)] if degree else [(0.0, 0.0)], entries, near)
-
-
-def test_a_law_that_is_no_polynomial_or_of_another_box_is_made_anew() -> None:
-    plant, wide = in_parameters("exp(p*t)", 3)
-    assert not wide.is_sharp and not wide.covers(wide.box)
-    law = Law(plant, 2.0, ParameterBox((0.35, 1.75), (0.0, 0.0)), 0, wide)
-    radii = [float(c.rad()) for stretch in law.stretches for c in stretch.table[0][0][0].coeffs()]
-    assert max(radii) < 1e-25
-    plant, wide = in_parameters(CUBIC, 3)
-    assert wide.covers(wide.box) and not wide.covers(ParameterBox((0.35, 1.75), (0.2, 0.0)))
-    # to the degree 0 a law is that in the middle, whatever its box
-    assert not in_parameters(CUBIC, 0)[1].covers(ParameterBox((0.35, 1.75), (0.0, 0.0)))
-    # its square is beyond the degree, in wide balls
-    assert not in_parameters("p^2 + t", 1)[1].is_sharp
-
-
-def test_the_degrees_of_entries_in_parameters_are_those_of_polynomials() -> None:
-    assert in_parameters(CUBIC, 4)[1].degrees.tolist() == [[3, 1, 0]]
-    assert in_parameters("0*t", 4)[1].degrees.tolist() == [[-1, 1, 0]]
-
-
 def test_boxes_hold_their_corners_whatever_is_rounded() -> None:
     for low, high in RNG.uniform(-1.0, 1.0, (200, 2)):
         low, high = min(low, high), max(low, high)
@@ -295,16 +245,6 @@ def test_a_box_holds_another_exactly() -> None:
     )
     assert whole.holds(ParameterBox((0.1 + 2.0**-56,), (0.2 - 2.0**-54,)))
     assert not ParameterBox((0.0, 0.0), (1.0, 1.0)).holds(ParameterBox((0.0, 0.5), (1.0, 0.75)))
-
-
-def test_units_of_slow_parts_make_them_small_enough_or_there_are_none() -> None:
-    for _ in range(100):
-        M = RNG.uniform(0.0, 1.0, (3, 3)) * 10.0 ** RNG.uniform(-6, 0.5, (3, 3))
-        ratios = laws._find_unit_factors(M)
-        if ratios is None:
-            assert np.abs(np.linalg.eigvals(M)).max() > 0.4 * LONG
-        else:
-            assert ratios.min() >= 1.0 and (M @ ratios <= LONG * ratios).all()
 
 
 def test_powers_of_the_time_that_are_left_out_are_in_the_balls_of_the_first() -> None:

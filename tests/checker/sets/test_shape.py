@@ -274,7 +274,8 @@ def test_what_a_linear_bound_of_the_support_loses_on_a_range_is_little(name):
 )
 def test_the_factor_of_a_round_set_is_outside_of_it_and_next_to_it(source):
     with ctx.workprec(160):
-        centre, L = source.centre, known(source).norm.outer
+        centre, norm = source.centre, known(source).norm
+        L = norm.L * (1.0 + norm.share) * (1.0 + 1e-12)
         for direction in np.random.default_rng(8).normal(size=(100, source.dimension)):
             c, m = balls(direction), balls(centre)
             length = [sum((arb(float(x)) * a for x, a in zip(column, c, strict=True)), arb(0)) for column in L.T]
