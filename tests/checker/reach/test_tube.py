@@ -213,7 +213,7 @@ def test_cells_are_above_the_worst_case_of_an_integrator_and_not_far_above(
             start = a + 0.4 * (b - a)
             for stop in {until(tube, start, b), until(tube, start, start + 0.001 * (b - a))}:
                 z = rng.normal(size=(2, 2))
-                for c, poly in zip(z, tube.cells(min(piece, len(PUSHES) - 1), start, stop, z, noise == "disc"),
+                for c, poly in zip(z, tube.cells(min(piece, len(PUSHES) - 1), start, stop, z),
                                    strict=True):  # fmt: skip
                     for share in (0.0, 1.0):
                         delta = rng.choice([-1.0, 1.0], 2) if degree else np.zeros(2)

@@ -45,7 +45,6 @@ ANSWERING = {
     "checker.claims.causal.",
     "checker.claims.claims._verify_causal_bound",
     "checker.claims.claims._verify_policy",
-    "checker.claims.claims._zero_nominal",
     "checker.claims.claims.derived_causal_bound",
     "checker.claims.multipliers._answer",
     "control.transcription.feedback.",
