@@ -101,10 +101,19 @@ REFUSALS: dict[str, dict[str, Refusal]] = {
             " breakpoints of their own"
         ),
     },
+    "two classes": {
+        "few functions": Refusal(
+            "fewer functions than pieces are not proven beside measurable disturbances", "dictionaries.disturbance"
+        ),
+    },
     "affine": {
-        "sparsest": Refusal(
-            "under feedback a constraint is no row of the decision: the method exchange knows such programs",
-            pairs=("sparsest",),
+        "sparsest": Refusal(  # raised in `sip.method`, which knows no control; a test compares the sentences
+            "exchange: with a policy that answers what is measured, a constraint is no row of the decision",
+            "method.name",
+            ("sparsest",),
+        ),
+        "plain rows": Refusal(
+            "under feedback a constraint is no row of the decision: the method exchange knows such programs"
         ),
         "literal": Refusal("formulation: expected reduced with a policy that answers what is measured, got {!r}"),
         "few functions of the control": Refusal(
@@ -170,6 +179,53 @@ REFUSALS: dict[str, dict[str, Refusal]] = {
         ),
         "control_step and repeat": Refusal(
             "an inner loop needs no control_step where a plan repeats; null does without", "policy.prestabilise"
+        ),
+    },
+    "resolve": {
+        "few functions of the control": Refusal(
+            "solving the remaining horizon needs a control in indicators of its pieces (piecewise_constant)", "resolve"
+        ),
+        "few functions of the disturbance": Refusal(
+            "solving the remaining horizon needs a disturbance that takes any value on each of its pieces, since what"
+            " is left of another depends on what has been",
+            "resolve",
+        ),
+        "two classes": Refusal("solving the remaining horizon needs disturbances of one class", "resolve"),
+        "pieces of their own": Refusal(
+            "solving the remaining horizon needs disturbances on the pieces of one dictionary", "resolve"
+        ),
+        "integral": Refusal(
+            "solving the remaining horizon needs integrals of controls alone, and none beside feedback: what states add"
+            " up to between measurements is not known",
+            "resolve",
+        ),
+        "delay": Refusal("solving the remaining horizon needs a control that acts at once, without a delay", "resolve"),
+        "prestabilise": Refusal(
+            "solving the remaining horizon needs a policy without an inner loop (prestabilise: null)", "resolve"
+        ),
+        "outputs": Refusal(
+            "solving the remaining horizon needs a policy that measures the whole state, not outputs", "resolve"
+        ),
+        "control_step and repeat": Refusal(
+            "solving the remaining horizon needs a control_step with flat sides, and no feedback beside it, where the"
+            " plan repeats",
+            "resolve",
+        ),
+    },
+    "horizon": {
+        "pieces of their own": Refusal(
+            "disturbances on the pieces of their dictionary, which become shorter with the horizon", "disturbance"
+        ),
+        "entries in t": Refusal(
+            "a system that stays the same with time: of another one no shorter horizon is looked at yet", "system"
+        ),
+        "delay": Refusal(
+            "of: horizon: a delay is no share of the horizon, so that nothing can be proven of an interval of horizons;"
+            " expected a problem without system.delay"
+        ),
+        "few functions of the control": Refusal(
+            "of: horizon: the control's dictionary has fewer functions than pieces; expected one that takes any"
+            " values on its pieces"
         ),
     },
 }

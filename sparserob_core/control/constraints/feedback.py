@@ -37,7 +37,7 @@ DEPENDENT_EQUATION_SHARE = 1e-12  # of the largest one, a singular value of equa
 
 def not_linear(indices: Array) -> tuple[Array, Array]:
     """Raise `InputError`: the family has no rows that are linear in the decision."""
-    raise refusal("affine", "sparsest")
+    raise refusal("affine", "plain rows")
 
 
 class Uncertain(Protocol):
