@@ -295,7 +295,7 @@ def refuse(
     curved = [convex.kind for convex in state_sets if convex.halfspaces() is None]
     leaning = [convex.kind for convex in uncertainty if fixed(problem)[1].size and Spread(((1, convex),)).leans]
     unsupported = " and ".join(sorted(classes)) if not classes <= {"piecewise_constant"} else ""
-    cases = {
+    cases: dict[str, bool | str] = {
         "few functions of the control": not control.is_indicators,
         "parameters": uncertain,
         "measurable": unsupported if "measurable" in classes else "",
