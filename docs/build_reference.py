@@ -1,15 +1,18 @@
-"""Writes docs/reference.md and configs/schema.json from what the program says of itself: ``make docs``."""
+"""Writes docs/reference.md, configs/schema.json and the table of pairs in docs/scope.md from what the program says of
+itself: ``make docs``."""
 
 from __future__ import annotations
 
 import inspect
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import click
 
 import sparserob_core as sr
+from sparserob_core.control.combinations import FEATURES, refused_pairs
 from sparserob_core.experiment.cli.main import commands
 from sparserob_core.experiment.config.extending import EXTENDS
 from sparserob_core.experiment.config.extending import MEANING as MEANS
@@ -22,6 +25,8 @@ from sparserob_core.experiment.terminal.printing import EXIT
 from sparserob_core.options import meanings
 
 ROOT = Path(__file__).resolve().parents[1]
+PAIRS_BEGIN, PAIRS_END = "<!-- pairs: by docs/build_reference.py -->", "<!-- end of pairs -->"
+REASONS = ["For every pair that is refused, the error says what is expected instead:"]
 MEANING = {
     0: "certified or verified",
     2: "the input is at fault",
@@ -205,10 +210,30 @@ def _first_sentence(thing: object) -> str:
     return (inspect.getdoc(thing) or "").split("\n\n")[0]
 
 
+def pairs() -> str:
+    """Return the page docs/scope.md with the table of pairs, and the reason of every pair that is refused."""
+    page = (ROOT / "docs" / "scope.md").read_text(encoding="utf-8")
+    before, rest = page.split(PAIRS_BEGIN)
+    after = rest.split(PAIRS_END)[1]
+    refused = {frozenset(pair) for *pair, _ in refused_pairs()}
+    signs = [["–" if {row, column} in refused else "●" for column in FEATURES] for row in FEATURES]
+    rows = [(f"{k}. {name}", *line) for k, (name, line) in enumerate(zip(FEATURES, signs, strict=True), 1)]
+    lines = table(("", *(str(k) for k in range(1, len(FEATURES) + 1))), rows)
+    numbers: dict[tuple[str, str], list[str]] = {}
+    for feature, companion, sentence in refused_pairs():
+        numbers.setdefault((feature, sentence), []).append(str(FEATURES.index(companion) + 1))
+    reasons = [
+        f"* {FEATURES.index(feature) + 1} with {', '.join(columns)}: {re.sub('{.*?}', '…', sentence)}."
+        for (feature, sentence), columns in numbers.items()
+    ]
+    return "\n".join([before + PAIRS_BEGIN, "", *lines, "", *REASONS, "", *reasons, "", PAIRS_END + after])
+
+
 def pages() -> Iterator[tuple[Path, str]]:
     """Every generated file with its text."""
     yield ROOT / "docs" / "reference.md", reference()
     yield ROOT / "configs" / "schema.json", schema()
+    yield ROOT / "docs" / "scope.md", pairs()
 
 
 if __name__ == "__main__":

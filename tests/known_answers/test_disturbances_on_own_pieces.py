@@ -336,7 +336,6 @@ def test_the_margin_enlarges_all_of_them(bounded):
         ({"breakpoints": [0.5, 2.0]}, "disturbance.0.breakpoints: expected times that increase"),
         ({"pieces": 2, "breakpoints": [0.0, 2.0]}, "disturbance.0: expected one of pieces and breakpoints, got both"),
         ({"pieces": 0}, "disturbance.0.pieces"),
-        ({"pieces": 2, "class": "measurable"}, "breakpoints: expected none where a disturbance of the list"),
     ],
 )
 def test_pieces_that_do_not_fit_are_refused(more, said):
@@ -344,8 +343,3 @@ def test_pieces_that_do_not_fit_are_refused(more, said):
     with pytest.raises(sr.InputError) as error:
         sr.run({"problem": keys, "dictionaries": {"control": OTHERS["control"]}}, quiet=True, figures=False)
     assert said in str(error.value)
-
-
-def test_feedback_on_pieces_of_their_own_is_refused():
-    with pytest.raises(sr.InputError, match="feedback needs a disturbance on the pieces of one dictionary"):
-        sr.solve(stated(), policy=sr.AffinePolicy(), **OTHERS)

@@ -8,6 +8,7 @@ from typing import Protocol, final
 
 import numpy as np
 
+from sparserob_core.control.combinations import refusal
 from sparserob_core.control.constraints.control import Places
 from sparserob_core.control.constraints.explanation import ConstraintSource, TimedExplanation, combination
 from sparserob_core.control.constraints.flat import FlatConstraint
@@ -19,7 +20,6 @@ from sparserob_core.control.feedback.loop_rows import LoopRows, shared
 from sparserob_core.control.problem.names import unit_of_row
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.reach.sizes import row_sizes
-from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.finite import UncertainRows
 from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation, Separation
@@ -37,7 +37,7 @@ DEPENDENT_EQUATION_SHARE = 1e-12  # of the largest one, a singular value of equa
 
 def not_linear(indices: Array) -> tuple[Array, Array]:
     """Raise `InputError`: the family has no rows that are linear in the decision."""
-    raise InputError("under feedback a constraint is no row of the decision: the method exchange knows such programs")
+    raise refusal("affine", "plain rows")
 
 
 class Uncertain(Protocol):

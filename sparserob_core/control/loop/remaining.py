@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sparserob_core.control.combinations import refuse_cases
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.terms.windows import MixedConstraint
@@ -11,31 +12,28 @@ from sparserob_core.control.response.time_grid import SAME_TIME
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.terms.accumulated import combine_states
 from sparserob_core.control.transcription.transcribe import prepare
-from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
 
 def refuse_remaining(model: Transcription) -> None:
     """Raise `InputError` for a problem whose remaining horizon is no problem of the same kind, in one sentence."""
     problem, classes = model.problem, model.problem.classes
-    reasons = {
-        "a control in indicators of its pieces (piecewise_constant)": not model.control.is_indicators,
-        "a disturbance that takes any value on each of its pieces, since what is left of another depends on what has"
-        " been": "l1_ball" in classes or (classes == {"piecewise_constant"} and not model.disturbance.is_complete),
-        "disturbances of one class": len(classes) > 1,
-        "disturbances on the pieces of one dictionary": problem.disturbance_breakpoints is not None,
-        "integrals of controls alone, and none beside feedback: what states add up to between measurements is not"
-        " known": any(model.feedback is not None or np.any(entry.H) for entry in combine_states(model.stated).integral),
-        "a control that acts at once, without a delay": problem.system.delay > 0.0,
-        "a policy that measures the whole state, not outputs": model.feedback is not None
-        and problem.measurements is not None,
-        "a control_step with flat sides, and no feedback beside it, where the plan repeats": bool(problem.repeat)
+    cases = {
+        "few functions of the control": not model.control.is_indicators,
+        "few functions of the disturbance": "l1_ball" in classes
+        or (classes == {"piecewise_constant"} and not model.disturbance.is_complete),
+        "two classes": len(classes) > 1,
+        "pieces of their own": problem.disturbance_breakpoints is not None,
+        "integral": any(
+            model.feedback is not None or np.any(entry.H) for entry in combine_states(model.stated).integral
+        ),
+        "delay": problem.system.delay > 0.0,
+        "outputs": model.feedback is not None and problem.measurements is not None,
+        "control_step and repeat": bool(problem.repeat)
         and problem.control_step is not None
         and (problem.control_step.halfspaces() is None or model.feedback is not None),
     }
-    for wanted, hindered in reasons.items():
-        if hindered:
-            raise InputError(f"solving the remaining horizon needs {wanted}", path="resolve")
+    refuse_cases("resolve", cases)
 
 
 def remaining_problem(

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import noun
+from sparserob_core.control.combinations import refusal
 from sparserob_core.control.problem.phase import Matrix, Phase
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.sets.sets import Product, product
@@ -229,11 +230,7 @@ def _check_breakpoints(where: str, one: Disturbance, every: Sequence[Disturbance
     if one.breakpoints is None:
         return None
     if {disturbance.kind for disturbance in every} != {"piecewise_constant"}:
-        raise InputError(
-            path=f"{where}.breakpoints",
-            expected="none where a disturbance of the list is not of the class piecewise_constant",
-            got="some",
-        )
+        raise refusal("pieces of their own", "measurable", path=f"{where}.breakpoints", got="some")
     times = as_bound("breakpoints", one.breakpoints)
     fits = times.ndim == 1 and times.size > 1 and times[0] == 0.0 and abs(times[-1] - horizon) <= SAME_TIME * horizon
     if not fits or not (np.diff(times) > SAME_TIME * horizon).all():

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import noun
+from sparserob_core.control.combinations import refusal, refuse_cases
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import WEIGHTS, Cost, checked_weights, counted, integrals
 from sparserob_core.control.problem.disturbances import (
@@ -339,21 +340,17 @@ class OptimalControlProblem(Term):
             for parameter, state in np.argwhere(system.dependence.affected).tolist():
                 if state in end.fixed:
                     returns = self.repeat and widths(self.initial_set, system.states)[state] == 0.0
-                    raise InputError(
+                    raise refusal(
+                        "fixed final state",
+                        "parameters and entries in t",
                         path="repeat" if returns else f"terminal.{i}",
-                        expected="final values fixed of states that no parameter reaches, beside the time t",
                         got=f"{self.names.state(state)}, which {system.names[parameter]} reaches",
                     )
 
     def _check_expanded(self) -> None:
         """Raise `InputError` for fixed final values where the state is no affine function of the parameters."""
-        if self.terminal_equalities:
-            raise InputError(
-                path="system.parameters",
-                expected="none beside fixed final values and the time t, or such that the state depends on affinely: to"
-                " the first power in B, E and c, and in A where they multiply what depends on none",
-                got="others",
-            )
+        is_fixed = bool(self.terminal_equalities)
+        refuse_cases("fixed final state", {"general parameters and entries in t": is_fixed}, got="others")
 
     def _check_execution(self) -> Array | None:
         """Return the errors of execution ``(m,)``, or ``None`` where there are none.
@@ -372,22 +369,16 @@ class OptimalControlProblem(Term):
             return None
         sets = [entry if isinstance(entry, ConvexSet) else entry.set for entry in (*self.path, *self.terminal_sets)]
         timed = self._find_timed_system()
-        refused = {
-            "fixed final values, which an error of execution misses: a terminal set such as box": bool(
-                self.terminal_equalities
-            ),
-            "parameters in another set than a box": timed is None,
-            "measurable disturbances in a curved set where the system has pieces or parameters": any(
-                bound.halfspaces() is None for bound in filter(None, [self.measurable])
-            )
+        cases = {
+            "fixed final state": bool(self.terminal_equalities),
+            "parameters in no box": timed is None,
+            "measurable in a curved set": any(bound.halfspaces() is None for bound in filter(None, [self.measurable]))
             and (bool(self.system.switches) or self.system.parameter_count > 0),
-            "curved sets of states with parameters that the state does not depend on affinely": timed is not None
+            "curved path and general parameters": timed is not None
             and timed.powers is not None
             and any(bound.halfspaces() is None for bound in sets),
         }
-        for combination, is_present in refused.items():
-            if is_present:
-                raise InputError(path="execution", expected=f"none beside {combination}", got=f"{shares.tolist()}")
+        refuse_cases("execution", cases, got=f"{shares.tolist()}")
         return shares
 
     def _find_timed_system(self) -> System | None:

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from sparserob_core.control.combinations import refusal
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.disturbances import Breakpoints, Classes, select_class
 from sparserob_core.control.response.time_grid import TimeGrid
@@ -183,10 +184,7 @@ def disturbance_model(
         return DisturbanceModel("measurable", bound, bound, grid, starts=np.arange(grid.pieces))
     if not isinstance(kind, str):
         if not dictionary.is_complete:
-            raise InputError(
-                "fewer functions than pieces are not proven beside measurable disturbances",
-                path="dictionaries.disturbance",
-            )
+            raise refusal("two classes", "few functions")
         alone = disturbance_model("piecewise_constant", bound, dictionary, grid)
         return replace(alone, kind="several", classes=kind)
     if kind == "l1_ball":

@@ -16,6 +16,7 @@ from typing import final
 
 import numpy as np
 
+from sparserob_core.control.combinations import refusal
 from sparserob_core.control.enclosures.polynomial import polynomial_bound
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.phase import Phase
@@ -88,11 +89,9 @@ def shorten_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalCo
                 got=f"one that ends at {entry.stop:g}",
             )
     if problem.disturbance_breakpoints is not None:
-        expected = "disturbances on the pieces of their dictionary, which become shorter with the horizon"
-        raise InputError(path="disturbance", expected=expected, got="breakpoints of their own")
+        raise refusal("horizon", "pieces of their own", got="breakpoints of their own")
     if problem.system.varies:
-        expected = "a system that stays the same with time: of another one no shorter horizon is looked at yet"
-        raise InputError(path="system", expected=expected, got="one in t")
+        raise refusal("horizon", "entries in t", got="one in t")
     shorter = problem.remaining(0.0, horizon)
     assert shorter is not None
     return shorter
@@ -124,15 +123,9 @@ class Horizons:
 
     def __post_init__(self) -> None:
         if self.problem.system.delay > 0.0:
-            raise InputError(
-                "of: horizon: a delay is no share of the horizon, so that nothing can be proven of an interval of"
-                " horizons; expected a problem without system.delay"
-            )
+            raise refusal("horizon", "delay")
         if not self.control.is_complete:
-            raise InputError(
-                "of: horizon: the control's dictionary has fewer functions than pieces; expected one that takes any"
-                " values on its pieces"
-            )
+            raise refusal("horizon", "few functions of the control")
         shorten_horizon(self.problem, self.problem.horizon)
         object.__setattr__(self, "control", self.control.merged())
 

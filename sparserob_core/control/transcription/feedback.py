@@ -11,6 +11,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.control.combinations import refuse_cases
 from sparserob_core.control.constraints.control import STEP, Places, held_at, of_control
 from sparserob_core.control.constraints.effort import FeedbackEffort
 from sparserob_core.control.constraints.feedback import FeedbackConstraint, FeedbackControl
@@ -303,35 +304,24 @@ def refuse(
     state_sets = [*(entry.set for entry in problem.of_states), *problem.terminal_sets]
     curved = [convex.kind for convex in state_sets if convex.halfspaces() is None]
     leaning = [convex.kind for convex in uncertainty if fixed(problem)[1].size and Spread(((1, convex),)).leans]
-    finer = "; more pieces in dictionaries.disturbance come as close to a measurable one as is wanted"
-    finer = finer if "measurable" in classes else ""
-    reasons = {
-        "control that can have any value on every piece: an answer to a measurement does not reach back before it": (
-            not control.is_indicators
-        ),
-        "system without uncertain parameters: else what is measured is not the disturbance alone": uncertain,
-        f"disturbance of the class piecewise_constant, not {' and '.join(sorted(classes))}{finer}": not classes
-        <= {"piecewise_constant"},
-        "disturbance on the pieces of one dictionary, not on some of its own": problem.disturbance_breakpoints
-        is not None,
-        f"set of disturbances and of initial states with an interior, or with sides that can be listed, which the"
-        f" {' and the '.join(slanted)} has not: a flat set is a box of its own coordinates, whose directions are the"
-        " columns of E": bool(slanted),
-        f"set of disturbances and of initial states with an interior, or of axes that are points, beside fixed final"
-        f" states, which the {' and the '.join(leaning)} has not: a small box of final states does": bool(leaning),
-        f"set of states with flat sides, which the {' and the '.join(dict.fromkeys(curved))} has not: a polytope inside"
-        " of it comes as close as is wanted": bool(curved),
-        "disturbance that takes any value on each of its pieces": bool(classes) and not disturbance.is_complete,
-        f"path constraint of another name than {' or '.join(map(str, named))}, which is taken": bool(named),
-        "whole state that is measured without noise where a plan with a control_step repeats": bool(problem.repeat)
+    unsupported = " and ".join(sorted(classes)) if not classes <= {"piecewise_constant"} else ""
+    cases: dict[str, bool | str] = {
+        "few functions of the control": not control.is_indicators,
+        "parameters": uncertain,
+        "measurable": unsupported if "measurable" in classes else "",
+        "l1_ball": unsupported,
+        "pieces of their own": problem.disturbance_breakpoints is not None,
+        "flat uncertainty": " and the ".join(slanted),
+        "fixed final state and flat uncertainty": " and the ".join(leaning),
+        "curved path": " and the ".join(dict.fromkeys(curved)),
+        "few functions of the disturbance": bool(classes) and not disturbance.is_complete,
+        "name that is taken": " or ".join(map(str, named)),
+        "control_step, repeat and outputs": bool(problem.repeat)
         and problem.control_step is not None
         and problem.measurements is not None,
-        f"cost of single channels where the policy is charged {cost}: without group": bool(problem.cost.blocks)
-        and cost != "nominal",
+        "group with a charge": cost if problem.cost.blocks and cost != "nominal" else "",
     }
-    for wanted, hindered in reasons.items():
-        if hindered:
-            raise InputError(f"feedback needs a {wanted}", path="policy.name")
+    refuse_cases("affine", cases)
 
 
 def build_inner_loop(
@@ -423,15 +413,13 @@ def _find_sides(convex: ConvexSet) -> tuple[Array, Array, Array]:
 
 def _refuse_inner_loop(problem: OptimalControlProblem) -> None:
     """Raise `InputError` for what an inner loop is not built for, in one sentence."""
-    reasons = {
-        "a plant that does not change with time": problem.system.varies,
-        "a control without delay": problem.system.delay > 0.0,
-        "a cost without quadratic terms and groups": not problem.cost.is_linear or bool(problem.cost.blocks),
-        "no control_step where a plan repeats": bool(problem.repeat) and problem.control_step is not None,
+    cases = {
+        "entries in t": problem.system.varies,
+        "delay": problem.system.delay > 0.0,
+        "quadratic cost or group": not problem.cost.is_linear or bool(problem.cost.blocks),
+        "control_step and repeat": bool(problem.repeat) and problem.control_step is not None,
     }
-    for wanted, hindered in reasons.items():
-        if hindered:
-            raise InputError(f"an inner loop needs {wanted}; null does without", path="policy.prestabilise")
+    refuse_cases("prestabilise", cases)
 
 
 def _has_zero_chord(convex: ConvexSet) -> bool:

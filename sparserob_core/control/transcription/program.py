@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 from scipy.sparse import block_array, csc_array, eye_array, kron, vstack
 
+from sparserob_core.control.combinations import refusal
 from sparserob_core.control.constraints.control import ControlConstraint, held_at
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.literal import LiteralConstraint
@@ -337,10 +338,7 @@ def _build_equalities(
         sigma = functionals.offsets(time, up[None], middle) + functionals.offsets(time, -up[None], middle)
         state = int(np.flatnonzero(up)[0])
         if sigma[0] > DIFFERENCE_ROUNDING * size or _is_uncertain_state(problem, parameters, state):
-            raise InputError(
-                f"terminal: equals: state {state + 1} depends on the uncertainty, so no control can fix its final"
-                f" value to {value:g}; expected a set with interior"
-            )
+            raise refusal("fixed final state", "uncertainty", state + 1, f"{value:g}")
         A.append(G)
         b.append(np.array([value - offset[0]]))
     return np.vstack(A), np.concatenate(b)

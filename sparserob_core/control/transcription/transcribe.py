@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from sparserob_core.control.combinations import refusal
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.policies.policy import Policy, answers_of
@@ -120,8 +121,7 @@ def prepare(
     refuse_without_steps(problem, control)
     mask = answers_of(policy, control.breakpoints, problem.measurements)
     if problem.execution is not None and mask.any():
-        expected = "none under feedback, where the size of the control, and with it that of its error, answers too"
-        raise InputError(path="execution", expected=expected, got=f"{np.asarray(problem.execution).tolist()}")
+        raise refusal("execution", "affine", got=f"{np.asarray(problem.execution).tolist()}")
     nominal_problem, inner = problem, NO_INNER_LOOP
     if policy is not None and mask.any():
         from sparserob_core.control.transcription import feedback
@@ -129,9 +129,7 @@ def prepare(
         control = control.by_values()  # what answers a measurement is a value, which must not reach back before it
         feedback.refuse(problem, control, disturbance, policy.charge.cost, user_problem.system.parameter_count > 0)
         if formulation != "reduced":
-            raise InputError(
-                f"formulation: expected reduced with a policy that answers what is measured, got {formulation!r}"
-            )
+            raise refusal("affine", "literal", formulation)
         inner = _build_inner_loop(policy, problem, user_problem.system.states, control, disturbance)
         nominal_problem = held_nominally(problem, inner)
     posed = _pose_problem(problem, nominal_problem, control, disturbance, inner)
@@ -152,10 +150,7 @@ def _merge_disturbance_grids(
     if problem.disturbance_breakpoints is None:
         return problem, disturbance
     if not disturbance.is_complete:
-        raise InputError(
-            "dictionaries.disturbance: fewer functions than pieces are not proven beside disturbances that have"
-            " breakpoints of their own"
-        )
+        raise refusal("pieces of their own", "few functions")
     common = disturbance.merged().breakpoints
     own = tuple(common if times is None else times for times in problem.disturbance_breakpoints)
     joint = distinct_times(np.concatenate(own), problem.horizon)
