@@ -15,6 +15,7 @@ from typing import Any, TypeAlias, TypeVar, final
 import numpy as np
 
 KEY = "quantity"
+UNITLESS = frozenset({"", "1", "s"})  # text, numbers without a unit, seconds of a clock
 R = TypeVar("R")
 Seal: TypeAlias = Callable[[np.ndarray], np.ndarray]
 Unit: TypeAlias = "float | np.ndarray | Callable[[Any], Any]"
@@ -91,7 +92,7 @@ def in_units(record: R, units: Mapping[str, Unit], seal: Seal = np.asarray) -> R
     record : dataclass
         The record.
     units : mapping
-        For the name of a unit the factor, or a function of the value. A field whose unit has no entry stays as it is.
+        For the name of a unit the factor, or a function of the value.
     seal : callable, optional
         A function that every new array is passed through.
 
@@ -99,11 +100,17 @@ def in_units(record: R, units: Mapping[str, Unit], seal: Seal = np.asarray) -> R
     -------
     dataclass
         The record. Fields that share one array share one afterwards.
+
+    Raises
+    ------
+    KeyError
+        If a field has a unit without an entry.
     """
     converted = dict[int, Any]()
     changes = dict[str, Any]()
-    for name, described in quantities(type(record)).items():
-        if described.unit in units and not described.after:
+    kind: type = type(record)
+    for name, described in quantities(kind).items():
+        if described.unit not in UNITLESS and not described.after:
             value = getattr(record, name)
             changes[name] = converted.setdefault(id(value), _scale(value, units[described.unit], seal))
     return replace(record, **changes)  # type: ignore[type-var]

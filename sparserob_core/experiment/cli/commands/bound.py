@@ -51,12 +51,12 @@ def bound(
     all the same, 130 interrupted.
     """
     from sparserob_core.experiment.bound.bound import bound as find
-    from sparserob_core.experiment.bound.record import list_bound_columns, list_bound_rows, summary_of_bound
+    from sparserob_core.experiment.bound.record import list_bound_columns, list_bound_rows
     from sparserob_core.experiment.cli.shell.live_line import LiveLine
 
     with LiveLine() as line:
         bounds = find(config, overrides, tolerance=tolerance, seconds=seconds, out=out, write=True, notify=line.receive)
     tables = [(bounds.title, list_bound_columns(bounds), list_bound_rows(bounds))]
     remarks = (*bounds.remarks, f"{bounds.status} in {bounds.seconds:.2f} s", f"written to {bounds.directory}")
-    report(as_json, summary_of_bound(bounds), tables, remarks)
+    report(as_json, bounds.summary(), tables, remarks)
     return status_unless_interrupted(EXIT[bounds.status])

@@ -74,7 +74,7 @@ def margin(
     is feasible at any factor, 4 a side could not be proven, 130 interrupted.
     """
     from sparserob_core.experiment.cli.shell.live_line import LiveLine
-    from sparserob_core.experiment.margin.margin import curve_rows, margin_rows, summary_of_margin
+    from sparserob_core.experiment.margin.margin import curve_rows, margin_rows
     from sparserob_core.experiment.margin.margin import margin as find
     from sparserob_core.experiment.run.viewer import recorded, recorder
 
@@ -94,7 +94,7 @@ def margin(
         tables.append(("Cost against the horizon", columns, curve_rows(answer)))
     recordings = (recording for observer in observers for recording in recorded(observer, save))
     remarks = (*answer.remarks, f"written to {answer.directory}", *recordings)
-    report(as_json, summary_of_margin(answer), tables, remarks)
+    report(as_json, answer.summary(), tables, remarks)
     if serve and answer.status != "undecided":  # the Ctrl-C that ends a page has cut nothing short
         return EXIT[answer.status]
     return status_unless_interrupted(EXIT[answer.status])
