@@ -38,8 +38,8 @@ class Quantity:
         Format of its number in that row.
     certified : str, default ""
         Entry of the certificate that it must equal; the certificate has this entry where both have one name.
-    always : bool, default False
-        Whether every version has written it.
+    recent : bool, default False
+        Whether an earlier version did not write it.
     proven : bool, default False
         Whether it is unknown unless the constraints are proven.
     after : str, default ""
@@ -51,14 +51,14 @@ class Quantity:
     label: str = ""
     form: str = ".9g"
     certified: str = ""
-    always: bool = False
+    recent: bool = False
     proven: bool = False
     after: str = ""
 
 
-def quantity(unit: str, meaning: str = "", **options: Any) -> Mapping[str, Quantity]:
+def quantity(unit: str, meaning: str = "", label: str = "", **options: Any) -> Mapping[str, Quantity]:
     """Return the metadata of a field that is a `Quantity`, from the parameters of that."""
-    return {KEY: Quantity(unit, meaning, **options)}
+    return {KEY: Quantity(unit, meaning, label, **options)}
 
 
 RECORD = "record"

@@ -238,37 +238,27 @@ class Result:
         Record of a method whose cost is that count, not ``J``.
     """
 
-    status: Status = field(metadata=quantity("", "what was proven; see method.md", certified="status", always=True))
-    message: str = field(metadata=quantity("", "the result in a sentence, or why there is none", always=True))
+    status: Status = field(metadata=quantity("", "what was proven; see method.md", certified="status"))
+    message: str = field(metadata=quantity("", "the result in a sentence, or why there is none"))
     decision: Array | None = field(default=None, metadata=quantity("decision"))
     cost: float = field(
         default=np.nan,
-        metadata=quantity(
-            "cost", "J of the returned control, without the regulariser", label="cost", certified="cost", always=True
-        ),
+        metadata=quantity("cost", "J of the returned control, without the regulariser", "cost", certified="cost"),
     )
-    value: float = field(default=np.nan, metadata=quantity("cost", "J and the weighted regulariser", always=True))
-    epsilon: float = field(
-        default=0.0, metadata=quantity("1", "weight of the regulariser that was solved", always=True)
-    )
+    value: float = field(default=np.nan, metadata=quantity("cost", "J and the weighted regulariser"))
+    epsilon: float = field(default=0.0, metadata=quantity("1", "weight of the regulariser that was solved"))
     lower_bound: float = field(
         default=-np.inf,
-        metadata=quantity(
-            "cost", "proven lower bound of the least cost", label="lower bound", certified="lower_bound", always=True
-        ),
+        metadata=quantity("cost", "proven lower bound of the least cost", "lower bound", certified="lower_bound"),
     )
     upper_bound: float = field(
         default=np.inf,
         metadata=quantity(
-            "cost",
-            "proven upper bound; empty unless the status is certified or verified",
-            label="upper bound",
-            always=True,
-            proven=True,
+            "cost", "proven upper bound; empty unless the status is certified or verified", "upper bound", proven=True
         ),
     )
-    cost_scale: float = field(default=0.0, metadata=quantity("cost", "what is added up to the cost"))
-    stopped: str = field(default="", metadata=quantity("", "the limit that ended the run early"))
+    cost_scale: float = field(default=0.0, metadata=quantity("cost", "what is added up to the cost", recent=True))
+    stopped: str = field(default="", metadata=quantity("", "the limit that ended the run early", recent=True))
     worst: WorstConstraint | None = field(default=None, metadata=RECORDS)
     indices: Sequence[Cut] = field(default=(), metadata=RECORDS)
     counts: Mapping[str, int] = field(default_factory=dict)
@@ -280,7 +270,7 @@ class Result:
     proofs: Sequence[Proof] = field(default=(), metadata=RECORDS)
     scenario_bound: ScenarioBound | None = None
     infeasible: InfeasibleSubsystem | None = None
-    seconds: float = field(default=0.0, metadata=quantity("s", "what the method took", always=True))
+    seconds: float = field(default=0.0, metadata=quantity("s", "what the method took"))
     ray: Array | None = field(default=None, metadata=quantity("decision"))
     missed: float | None = None
     errors: EqualityErrors | None = field(default=None, metadata=RECORDS)
@@ -289,13 +279,7 @@ class Result:
 
     DERIVED: ClassVar[Mapping[str, Quantity]] = {
         "gap": Quantity(
-            "1",
-            "relative distance of the bounds",
-            label="relative gap",
-            form=".2e",
-            always=True,
-            proven=True,
-            after="upper_bound",
+            "1", "relative distance of the bounds", "relative gap", form=".2e", proven=True, after="upper_bound"
         )
     }
 

@@ -416,9 +416,10 @@ def read_summary(file: Path) -> dict[str, Any]:
     if not isinstance(status, str) or status not in MEANING:
         raise InputError(f"{file}: expected the result of a run, with a status ({', '.join(MEANING)}), got {status!r}")
     for name, described in statistics(Result).items():
-        value = summary.setdefault(name, None if described.unit else "") if described.always else summary.get(name)
+        empty = None if described.unit else ""
+        value = summary.get(name, empty) if described.recent else summary.setdefault(name, empty)
         if not described.unit:
-            if described.always and not isinstance(value, str):
+            if not isinstance(value, str):
                 raise InputError(f"{file}: {name}: expected text, got {value!r}")
         elif value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
             raise InputError(f"{file}: {name}: expected a number or null, got {value!r}")

@@ -143,7 +143,7 @@ def stored_result(run: StoredRun) -> Result:
             decision=decision if decision.size else None,
             worst=_read_worst(summary["worst"], solution),
             proofs=[
-                Proof(str(name), "proven", _get_number(tolerance, "proven"))
+                Proof(str(name), "proven", float(np.nan if tolerance.get("proven") is None else tolerance["proven"]))
                 for name, tolerance in summary.get("tolerances", {}).items()
             ],
             counts={str(name): int(count) for name, count in summary["counts"].items() if isinstance(count, int)},
@@ -187,10 +187,6 @@ def _read_statistics(summary: Mapping[str, Any], kind: type[Result] = Result) ->
         for name, described in statistics(kind).items()
         if not described.after and summary.get(name) is not None
     }
-
-
-def _get_number(summary: Mapping[str, Any], name: str, missing: float = np.nan) -> float:
-    return missing if summary.get(name) is None else float(summary[name])
 
 
 def _replay_searches(trace: SearchTrace, inspection: Inspection) -> Iterator[tuple[int, EvaluationsFinished]]:

@@ -49,28 +49,9 @@ def write_study(
 ) -> S:
     """Write the files of a study, and return its result with its directory.
 
-    The figure is an extra: where it cannot be drawn, the numbers are written all the same, and there is a warning
-    among the ``remarks`` of the result.
-
-    Parameters
-    ----------
-    directory : RunDirectory
-        The directory of the study.
-    name : str
-        The name of ``name.json`` and ``name.png``.
-    study : dataclass
-        The result.
-    draw : callable or None
-        A function that draws the result and ``arguments``; ``None`` where there is nothing to draw.
-    arrays : mapping, optional
-        For the name of each further file its arrays.
-    more : mapping, optional
-        Entries of the JSON file that follow those of the result.
-
-    Returns
-    -------
-    dataclass
-        The result.
+    They are ``name.json`` with the entries ``more`` at its end, ``name.png`` drawn of the result and ``arguments``
+    (``draw=None``: there is nothing to draw), and the ``arrays`` of each further file. The figure is an extra: where
+    it cannot be drawn, the numbers are written all the same, and there is a warning among the ``remarks``.
     """
     from sparserob_core.experiment.figures.style import draw_extra
 
@@ -80,8 +61,7 @@ def write_study(
         remarks = draw_extra(directory.path / f"{name}.png", draw, study, *arguments)
         study = replace(study, remarks=(*study.remarks, *remarks))
     directory.write_json(f"{name}.json", {**study.summary(), **more})
-    result: S = replace(study, directory=directory.path)
-    return result
+    return replace(study, directory=directory.path)
 
 
 def open_run(run: GivenRun, plugins: Iterable[str | Path], out: str | Path | None) -> FinishedRun:
@@ -111,7 +91,6 @@ def write_into_run(
     if out is None:
         return study
     if missing := missing_matplotlib():
-        unfinished: S = replace(study, undrawn=missing)
-        return unfinished
+        return replace(study, undrawn=missing)
     save_figure(Path(out), draw, drawn, stored_figure_data(finished))
     return study

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial, singledispatchmethod
+from functools import partial
 from types import MappingProxyType
 from typing import Any, TypeVar, final
 
@@ -27,7 +27,7 @@ from sparserob_core.sip.events import (
     frozen,
     ignore,
 )
-from sparserob_core.sip.evidence import Cut, Dual, Leaf, Proof
+from sparserob_core.sip.evidence import Cut, Leaf, Proof
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.program import (
     ConstraintFamily,
@@ -114,7 +114,7 @@ class UsersUnits:
     def _convert(self, own: R, above: Mapping[str, Unit] = MappingProxyType({}), seal: Seal = np.asarray) -> R:
         """Convert a record and those in its fields; ``above`` has the units of the record that it is a field of."""
         seal = frozen if isinstance(own, Event) else seal
-        units = {"cost": self.cost, "value": self.cost, **above, **self._list_units(own)}
+        units = {**(above or self._list_program_units()), **self._list_units(own)}
 
         def convert_nested(nested: Any) -> Any:
             if isinstance(nested, Mapping):
@@ -124,56 +124,50 @@ class UsersUnits:
         units[RECORD] = convert_nested
         return in_units(own, units, seal)
 
-    @singledispatchmethod
-    def _list_units(self, own: object) -> dict[str, Unit]:
-        """Return the units of the fields of one record, as far as they are its own."""
-        return {}
-
-    @_list_units.register
-    def _of_result(self, own: Result) -> dict[str, Unit]:
-        value = 1.0 if own.status == "infeasible" else self.cost
-        return {"decision": self.decision, "equalities": self.equalities, "value": value}
-
-    @_list_units.register
-    def _of_leaf(self, own: Leaf) -> dict[str, Unit]:
-        return {"value": self.cost if own.feasible else 1.0}
-
-    @_list_units.register
-    def _of_dual(self, own: Dual) -> dict[str, Unit]:
-        has_equalities = own.mu.size == self.equalities.size
-        return {"mu": self.cost / self.equalities if has_equalities else 1.0, "z": self.cost / self.image}
-
-    @_list_units.register
-    def _of_cut(self, own: Cut) -> dict[str, Unit]:
-        index = self._find_index_units(own.family, own.formulation, own.index.size)
-        return {"index": index, "price": self._compute_price(own)}
-
-    @_list_units.register
-    def _of_witness(self, own: WorstConstraint) -> dict[str, Unit]:
-        index = self._find_index_units(own.constraint, own.formulation, own.index.size)
-        return {"index": index, "row": self._find_row_unit(own.constraint, own.row)}
-
-    @_list_units.register
-    def _of_proof(self, own: Proof) -> dict[str, Unit]:
-        def scale_index(index: Array) -> Array:
-            return index * self._find_index_units(own.family, own.formulation, index.shape[-1])
-
+    def _list_program_units(self) -> dict[str, Unit]:
+        """Return the units that all records have in common."""
         return {
-            "index": scale_index,
-            "row": own.unit,
-            "bound": partial(self._convert_bound, own.family),
+            "cost": self.cost,
+            "value": self.cost,
+            "decision": self.decision,
+            "equalities": self.equalities,
+            "mu": lambda mu: mu * self.cost / self.equalities if mu.size == self.equalities.size else mu,
+            "z": self.cost / self.image,
         }
 
-    @_list_units.register
-    def _of_progress(self, own: ProofProgress) -> dict[str, Unit]:
-        return {"bound": partial(self._convert_bound, own.family)}
+    def _list_units(self, own: object) -> dict[str, Unit]:
+        """Return the units of the fields of one record, as far as they are its own."""
+        match own:
+            case Result():
+                return {"value": 1.0 if own.status == "infeasible" else self.cost}
+            case Leaf():
+                return {"value": self.cost if own.feasible else 1.0}
+            case Cut():
+                index = self._find_index_units(own.family, own.formulation, own.index.size)
+                return {"index": index, "price": self._compute_price(own)}
+            case WorstConstraint():
+                index = self._find_index_units(own.constraint, own.formulation, own.index.size)
+                return {"index": index, "row": self._find_row_unit(own.constraint, own.row)}
+            case Proof():
+                size = next((np.shape(index)[-1] for index in (own.index, *(own.leaves or ())) if index is not None), 0)
+                index = self._find_index_units(own.family, own.formulation, size)
+                return {"index": index, "row": own.unit, "bound": partial(self._convert_bound, own.family)}
+            case ProofProgress():
+                return {"bound": partial(self._convert_bound, own.family)}
+            case SearchTrace():
+                width = own.points.shape[1]
+                block = max((family.index_set.dimension for family in self._list_searched_families(width)), default=1)
+                return {"index": self.tuple_units(width, block)}
+            case RoundFinished():
+                return self._list_round_units(own)
+            case EvaluationsFinished():
+                return self._list_evaluation_units(own)
+        return {}
 
-    @_list_units.register
-    def _of_round(self, own: RoundFinished) -> dict[str, Unit]:
+    def _list_round_units(self, own: RoundFinished) -> dict[str, Unit]:
         worst = own.separations.get(own.worst_family)
         row = int(worst.rows[0]) if worst is not None and worst.rows.size else 0
         return {
-            "decision": self.decision,
             "row": self._find_row_unit(own.worst_family, row),
             "separations": lambda separations: {
                 name: in_units(separation, self._list_separation_units(name, separation))
@@ -190,8 +184,7 @@ class UsersUnits:
             "bound": 1.0 if rows is None else float(rows.max()),
         }
 
-    @_list_units.register
-    def _of_evaluations(self, own: EvaluationsFinished) -> dict[str, Unit]:
+    def _list_evaluation_units(self, own: EvaluationsFinished) -> dict[str, Unit]:
         size = own.best_point.size if own.domain is None else own.domain.dimension
         units = self._find_index_units(own.family, "reduced", size) if own.family else self.tuple_units(size, own.block)
         return {
@@ -199,12 +192,6 @@ class UsersUnits:
             "box": lambda box: Box(frozen(box.lower * units), frozen(box.upper * units)),
             "value": 1.0 if own.family else self.cost,
         }
-
-    @_list_units.register
-    def _of_trace(self, own: SearchTrace) -> dict[str, Unit]:
-        width = own.points.shape[1]
-        block = max((family.index_set.dimension for family in self._list_searched_families(width)), default=1)
-        return {"index": self.tuple_units(width, block)}
 
     def _convert_bound(self, name: str, bound: float) -> float:
         """The least bound in the user's units that holds for every row of a family that is bounded in their own."""

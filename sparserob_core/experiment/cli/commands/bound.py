@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from sparserob_core.experiment.cli.shell.options import json_option
+from sparserob_core.experiment.cli.shell.options import json_option, study_out_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.cli.shell.report import report
 from sparserob_core.experiment.terminal.printing import EXIT
@@ -29,13 +29,7 @@ from sparserob_core.experiment.terminal.printing import EXIT
     help="Stop after N seconds: both sides hold as far as they were brought; limits.seconds of CONFIG unless given.",
 )
 @json_option("bound.json")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help=(
-        "A new or empty directory for the config, bound.json and bound.png; runs/NAME-bound/STAMP-HASH unless given."
-    ),
-)
+@study_out_option("bound")
 def bound(
     config: Path, overrides: tuple[str, ...], tolerance: float, seconds: float | None, as_json: bool, out: Path | None
 ) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from sparserob_core.experiment.cli.shell.options import json_option, watching_options
+from sparserob_core.experiment.cli.shell.options import json_option, study_out_option, watching_options
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.cli.shell.report import Table, report
 
@@ -36,13 +36,7 @@ EXIT = {"certified": 0, "unbounded": 0, "infeasible": 3, "undecided": 4}
     "--curve", type=int, default=20, show_default=True, help="Points of the curve of cost against the factor; 0: none."
 )
 @json_option("margin.json")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help=(
-        "A new or empty directory for the config, margin.json and margin.png; runs/NAME-margin/STAMP-HASH unless given."
-    ),
-)
+@study_out_option("margin")
 @watching_options("the search")
 def margin(
     config: Path,
