@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
+from sparserob_core.quantities import RECORDS, quantity
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.maximiser import Trace
@@ -128,14 +129,14 @@ class Batch:
         Value at that point.
     """
 
-    points: Sequence[Array] = ()
-    values: Sequence[Array] = ()
+    points: Sequence[Array] = field(default=(), metadata=quantity("index"))
+    values: Sequence[Array] = field(default=(), metadata=quantity("value"))
     moments: Sequence[tuple[int, float]] = ()
     notes: Mapping[str, Sequence[tuple[float, float]]] = field(default_factory=dict)
     first: int = 0
-    best: float = -np.inf
-    origin: Array | None = None
-    stood: float = np.nan
+    best: float = field(default=-np.inf, metadata=quantity("value"))
+    origin: Array | None = field(default=None, metadata=quantity("index"))
+    stood: float = field(default=np.nan, metadata=quantity("value"))
 
     @cached_property
     def trace(self) -> Trace:
@@ -256,8 +257,8 @@ class Sketch:
         Whether the regions are the ellipsoids within the boxes.
     """
 
-    lower: Array
-    upper: Array
+    lower: Array = field(metadata=quantity("index"))
+    upper: Array = field(metadata=quantity("index"))
     rounded: bool = False
 
     @property
@@ -318,25 +319,25 @@ class RoundFinished(Event):
 
     round: int
     epsilon: float
-    lower_bound: float
-    upper_bound: float
-    violation: float
+    lower_bound: float = field(metadata=quantity("cost"))
+    upper_bound: float = field(metadata=quantity("cost"))
+    violation: float = field(metadata=quantity("row"))
     worst_family: str = ""
     active_indices: int = 0
     cuts_added: int = 0
     cuts_dropped: int = 0
     relaxed_programs: int = 0
     seconds: float = 0.0
-    cost: float = np.nan
-    decision: Array | None = field(default=None, repr=False)
-    separations: Mapping[str, Separation] = field(default_factory=dict, repr=False)
-    imposed: Sequence[Cut] = field(default=(), repr=False)
-    multipliers: Array = field(default_factory=lambda: np.zeros(0), repr=False)
-    added: Sequence[Cut] = field(default=(), repr=False)
-    dropped: Sequence[Cut] = field(default=(), repr=False)
+    cost: float = field(default=np.nan, metadata=quantity("cost"))
+    decision: Array | None = field(default=None, repr=False, metadata=quantity("decision"))
+    separations: Mapping[str, Separation] = field(default_factory=dict, repr=False, metadata=quantity("separations"))
+    imposed: Sequence[Cut] = field(default=(), repr=False, metadata=RECORDS)
+    multipliers: Array = field(default_factory=lambda: np.zeros(0), repr=False, metadata=quantity("prices"))
+    added: Sequence[Cut] = field(default=(), repr=False, metadata=RECORDS)
+    dropped: Sequence[Cut] = field(default=(), repr=False, metadata=RECORDS)
     simplified: bool = False
     gap: float = np.inf
-    proven: float = np.inf
+    proven: float = field(default=np.inf, metadata=quantity("cost"))
     measured: str = ""
 
 
@@ -369,11 +370,11 @@ class ProofProgress(Event):
 
     family: str
     cells: int
-    bound: float
+    bound: float = field(metadata=quantity("bound"))
     seconds: float = 0.0
     examined: int = 0
     budget: int = 0
-    bound_before: float = np.nan
+    bound_before: float = field(default=np.nan, metadata=quantity("bound"))
     hindrance: str = ""
     measured: str = ""
 
@@ -443,19 +444,19 @@ class EvaluationsFinished(Event):
 
     count: int
     total: int
-    best_value: float
+    best_value: float = field(metadata=quantity("value"))
     seconds: float = 0.0
     notes: Mapping[str, float] = field(default_factory=dict)
     budget: int = 0
-    best_point: Array = field(default_factory=lambda: np.zeros(0), repr=False)
-    domain: Box | None = field(default=None, repr=False)
+    best_point: Array = field(default_factory=lambda: np.zeros(0), repr=False, metadata=quantity("index"))
+    domain: Box | None = field(default=None, repr=False, metadata=quantity("box"))
     block: int = 1
     phase: Phase = "search"
     family: str = ""
     round: int = 0
     epsilon: float = np.nan
-    lower_bound: float = -np.inf
-    batch: Batch = field(default_factory=Batch, repr=False)
-    sketches: Mapping[str, Sketch] = field(default_factory=dict, repr=False)
+    lower_bound: float = field(default=-np.inf, metadata=quantity("cost"))
+    batch: Batch = field(default_factory=Batch, repr=False, metadata=RECORDS)
+    sketches: Mapping[str, Sketch] = field(default_factory=dict, repr=False, metadata=RECORDS)
     coordinates: tuple[int, ...] = ()
     deciding: np.ndarray = field(default_factory=lambda: np.zeros((0, DECIDING), dtype=int), repr=False)

@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias, final
 import numpy as np
 
 from sparserob_core.brief import brief
+from sparserob_core.quantities import RECORDS, quantity
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import TOLERANCE, Formulation
 
@@ -33,9 +34,9 @@ class Cut:
     """
 
     family: str
-    index: Array
+    index: Array = field(metadata=quantity("index"))
     row: int
-    multiplier: float = 0.0
+    multiplier: float = field(default=0.0, metadata=quantity("price"))
     formulation: Formulation = "reduced"
 
     __repr__ = brief
@@ -61,12 +62,12 @@ class Dual:
         Decision at which quadratic terms and norms of the cost are replaced by their tangents, where there are any.
     """
 
-    bound: float
-    cuts: Sequence[Cut]
-    mu: Array
-    z: Array | None = None
-    fixed: Array = field(default_factory=lambda: np.zeros(0))
-    at: Array | None = None
+    bound: float = field(metadata=quantity("value"))
+    cuts: Sequence[Cut] = field(metadata=RECORDS)
+    mu: Array = field(metadata=quantity("mu"))
+    z: Array | None = field(default=None, metadata=quantity("z"))
+    fixed: Array = field(default_factory=lambda: np.zeros(0), metadata=quantity("cost"))
+    at: Array | None = field(default=None, metadata=quantity("decision"))
 
     __repr__ = brief
 
@@ -184,13 +185,13 @@ class Proof:
 
     family: str
     verdict: Literal["proven", "refuted", "undecided"]
-    bound: float
-    violation: float = -np.inf
-    index: Array | None = None
+    bound: float = field(metadata=quantity("bound"))
+    violation: float = field(default=-np.inf, metadata=quantity("row"))
+    index: Array | None = field(default=None, metadata=quantity("index"))
     row: int = 0
     cells: int = 0
     reason: str = ""
-    leaves: tuple[Array, Array] | None = None
+    leaves: tuple[Array, Array] | None = field(default=None, metadata=quantity("index"))
     formulation: Formulation = "reduced"
     unit: float = 1.0
     measured: str = ""
@@ -214,7 +215,7 @@ class Leaf:
         False where the part is proven infeasible.
     """
 
-    dual: Dual
+    dual: Dual = field(metadata=RECORDS)
     feasible: bool = True
 
 
@@ -263,10 +264,10 @@ class Sparsest:
         Alphabet to which the entries of ``S x`` are restricted, where there is one.
     """
 
-    norm: float
-    plain: float | None
+    norm: float = field(metadata=quantity("cost"))
+    plain: float | None = field(metadata=quantity("cost"))
     plain_count: float | None
-    tree: Tree
+    tree: Tree = field(metadata=RECORDS)
     letters: Sequence[float] | None = None
 
     __repr__ = brief

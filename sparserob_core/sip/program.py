@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from sparserob_core.brief import brief
 from sparserob_core.errors import InputError
+from sparserob_core.quantities import quantity
 from sparserob_core.shapes import Float, sealed, shaped
 from sparserob_core.sip.convex_set import Array, Box, as_bound
 from sparserob_core.sip.convexity import require_convex, sparse_matrix
@@ -56,10 +57,10 @@ class Separation:
         Formulation to which the indices belong.
     """
 
-    indices: Array
+    indices: Array = field(metadata=quantity("index"))
     rows: Array
-    violations: Array
-    bound: float = np.inf
+    violations: Array = field(metadata=quantity("rows"))
+    bound: float = field(default=np.inf, metadata=quantity("bound"))
     formulation: Formulation = "reduced"
 
 
@@ -102,9 +103,9 @@ class WorstConstraint:
         Formulation to which the index belongs.
     """
 
-    violation: float
+    violation: float = field(metadata=quantity("row"))
     constraint: str
-    index: Array
+    index: Array = field(metadata=quantity("index"))
     row: int = 0
     formulation: Formulation = "reduced"
 
@@ -738,8 +739,8 @@ class EqualityErrors:
         Reason for large bounds, and a remedy.
     """
 
-    missed: Array
-    allowed: Array
+    missed: Array = field(metadata=quantity("equalities"))
+    allowed: Array = field(metadata=quantity("equalities"))
     advice: str = ""
 
     @property

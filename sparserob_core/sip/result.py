@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
 
 import numpy as np
 
 from sparserob_core.brief import brief
+from sparserob_core.quantities import RECORDS, Quantity, quantity
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished, gains
 from sparserob_core.sip.evidence import NO_BOUND, Activity, Cut, Dual, InfeasibleSubsystem, Proof, Sparsest
@@ -67,10 +68,10 @@ class SearchTrace:
 
     outer: Array
     epsilon: Array
-    value: Array
-    bound: Array
+    value: Array = field(metadata=quantity("cost"))
+    bound: Array = field(metadata=quantity("cost"))
     seconds: Array
-    points: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    points: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False, metadata=quantity("index"))
     notes: Mapping[str, Array] = field(default_factory=dict, repr=False)
     polished: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool), repr=False)
 
@@ -237,33 +238,50 @@ class Result:
         Record of a method whose cost is that count, not ``J``.
     """
 
-    status: Status
-    message: str
-    decision: Array | None = None
-    cost: float = np.nan
-    value: float = np.nan
-    epsilon: float = 0.0
-    lower_bound: float = -np.inf
-    upper_bound: float = np.inf
-    worst: WorstConstraint | None = None
-    indices: Sequence[Cut] = ()
+    status: Status = field(metadata=quantity("", "what was proven; see method.md", certified="status"))
+    message: str = field(metadata=quantity("", "the result in a sentence, or why there is none"))
+    decision: Array | None = field(default=None, metadata=quantity("decision"))
+    cost: float = field(
+        default=np.nan,
+        metadata=quantity("cost", "J of the returned control, without the regulariser", "cost", certified="cost"),
+    )
+    value: float = field(default=np.nan, metadata=quantity("cost", "J and the weighted regulariser"))
+    epsilon: float = field(default=0.0, metadata=quantity("1", "weight of the regulariser that was solved"))
+    lower_bound: float = field(
+        default=-np.inf,
+        metadata=quantity("cost", "proven lower bound of the least cost", "lower bound", certified="lower_bound"),
+    )
+    upper_bound: float = field(
+        default=np.inf,
+        metadata=quantity(
+            "cost", "proven upper bound; empty unless the status is certified or verified", "upper bound", proven=True
+        ),
+    )
+    cost_scale: float = field(default=0.0, metadata=quantity("cost", "what is added up to the cost", recent=True))
+    stopped: str = field(default="", metadata=quantity("", "the limit that ended the run early", recent=True))
+    worst: WorstConstraint | None = field(default=None, metadata=RECORDS)
+    indices: Sequence[Cut] = field(default=(), metadata=RECORDS)
     counts: Mapping[str, int] = field(default_factory=dict)
     solved_by: Mapping[str, int] = field(default_factory=dict)
     unanswered: Sequence[Unanswered] = ()
-    history: Sequence[RoundFinished] = ()
-    trace: SearchTrace | None = None
-    dual: Dual = NO_BOUND
-    proofs: Sequence[Proof] = ()
+    history: Sequence[RoundFinished] = field(default=(), metadata=RECORDS)
+    trace: SearchTrace | None = field(default=None, metadata=RECORDS)
+    dual: Dual = field(default=NO_BOUND, metadata=RECORDS)
+    proofs: Sequence[Proof] = field(default=(), metadata=RECORDS)
     scenario_bound: ScenarioBound | None = None
     infeasible: InfeasibleSubsystem | None = None
-    seconds: float = 0.0
-    cost_scale: float = 0.0
-    stopped: str = ""
-    ray: Array | None = None
+    seconds: float = field(default=0.0, metadata=quantity("s", "what the method took"))
+    ray: Array | None = field(default=None, metadata=quantity("decision"))
     missed: float | None = None
-    errors: EqualityErrors | None = None
+    errors: EqualityErrors | None = field(default=None, metadata=RECORDS)
     activity: Activity | None = None
-    sparsest: Sparsest | None = None
+    sparsest: Sparsest | None = field(default=None, metadata=RECORDS)
+
+    DERIVED: ClassVar[Mapping[str, Quantity]] = {
+        "gap": Quantity(
+            "1", "relative distance of the bounds", "relative gap", form=".2e", proven=True, after="upper_bound"
+        )
+    }
 
     def accounted(self, solver: Solver) -> Result:
         """Return this result with the account of a `Named` solver: its failures, and the number of all its calls.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,19 +15,18 @@ from sparserob_core.control.studies.suprema import bound_rows
 from sparserob_core.control.transcription.terms.accumulated import integrals_as_states
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import build, control_problem_of, dictionaries_of, name_of
-from sparserob_core.experiment.bound.record import Bound, WorstCase, summary_of_bound, worst_case
+from sparserob_core.experiment.bound.record import Bound, WorstCase, envelopes, worst_case
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.matrices.arrays import read_arrays
-from sparserob_core.experiment.directory.artefacts import RunDirectory
-from sparserob_core.experiment.directory.study import open_study
 from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.run.given import GivenConfig, as_config, as_run
 from sparserob_core.experiment.run.outcome import Outcome, SolvedProblem
+from sparserob_core.experiment.study.kit import open_study, write_study
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.limits.deadline import Deadline
 
-__all__ = ["Bound", "WorstCase", "bound", "summary_of_bound"]
+__all__ = ["Bound", "WorstCase", "bound"]
 
 NARROWEST = 1e-7  # smallest tolerance, relative to a worst case: with a tenth of it rounding errors would matter
 
@@ -77,6 +75,8 @@ def bound(
     InputError
         If an argument, the config or the run is at fault. A run whose control answers measurements is refused too.
     """
+    from sparserob_core.experiment.bound.figure import draw_bound
+
     if not hasattr(tolerance, "__float__") or not NARROWEST <= float(tolerance) <= 0.1:
         raise InputError(f"tolerance: expected a number from {NARROWEST:g} to 0.1, got {tolerance!r}")
     if seconds is not None and (not hasattr(seconds, "__float__") or not float(seconds) > 0.0):
@@ -117,7 +117,11 @@ def bound(
             ),
             time_unit=problem.names.time,
         )
-        return result if directory is None else _write_files(directory, result, loaded)
+        if directory is None:
+            return result
+        draw = draw_bound if any(row.edges.size for row in rows) else None
+        more = {"config": loaded.config.digest()}
+        return write_study(directory, "bound", result, draw, arrays={"envelopes.npz": envelopes(result)}, more=more)
 
 
 def _has_answering_policy(loaded: Loaded, problem: OptimalControlProblem, control: Dictionary) -> bool:
@@ -150,22 +154,3 @@ def _read_control(config: object) -> Array | None:
     if "theta" not in solution:
         raise InputError(f"{path}: there is no control in it; a config bounds worst cases without any")
     return solution["theta"]
-
-
-def _write_files(directory: RunDirectory, found: Bound, loaded: Loaded) -> Bound:
-    """Write the files of worst cases, and return them with their directory.
-
-    The figure is an extra: where it cannot be drawn, the numbers are written all the same, and there is a warning.
-    """
-    from sparserob_core.experiment.bound.figure import draw_bound
-    from sparserob_core.experiment.figures.style import draw_extra
-
-    directory.write_arrays(
-        "envelopes.npz",
-        {f"{name}{i}": getattr(row, name) for i, row in enumerate(found.rows) for name in ("edges", "low", "high")},
-    )
-    if any(row.edges.size for row in found.rows):
-        remarks = draw_extra(directory.path / "bound.png", draw_bound, found)
-        found = replace(found, remarks=(*found.remarks, *remarks))
-    directory.write_json("bound.json", {**summary_of_bound(found), "config": loaded.config.digest()})
-    return replace(found, directory=directory.path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, final
 
@@ -11,7 +11,7 @@ import numpy as np
 from sparserob_core.brief import brief
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.suprema import BoundedRow, Sense
-from sparserob_core.experiment.directory.artefacts import finite
+from sparserob_core.experiment.directory.artefacts import UNWRITTEN, finite
 from sparserob_core.shapes import sealed
 from sparserob_core.sip.convex_set import Array
 
@@ -84,9 +84,9 @@ class WorstCase:
     disturbance: Array | None
     cells: int
     reason: str
-    edges: Array = field(repr=False)
-    low: Array = field(repr=False)
-    high: Array = field(repr=False)
+    edges: Array = field(repr=False, metadata=UNWRITTEN)
+    low: Array = field(repr=False, metadata=UNWRITTEN)
+    high: Array = field(repr=False, metadata=UNWRITTEN)
     corner: str = ""
     stated: Array | None = field(default=None, repr=False)
 
@@ -194,11 +194,15 @@ class Bound:
     tolerance: float
     decision: Array | None
     seconds: float
-    directory: Path | None = None
+    directory: Path | None = field(default=None, metadata=UNWRITTEN)
     remarks: tuple[str, ...] = ()
     time_unit: str = ""
 
     __repr__ = brief
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of ``bound.json``: every field but the directory and the envelopes."""
+        return {"format": 1, **finite(self)}
 
     @property
     def over_parameters(self) -> tuple[WorstCase, ...]:
@@ -214,20 +218,9 @@ class Bound:
 ENVELOPE = ("edges", "low", "high")
 
 
-def summary_of_bound(found: Bound) -> dict[str, Any]:
-    """Return the contents of ``bound.json``: every field but the directory and the envelopes.
-
-    Numbers that are not finite become null.
-    """
-    rows = [{name: _to_plain(value) for name, value in vars(row).items() if name not in ENVELOPE} for row in found.rows]
-    summary: dict[str, Any] = finite(asdict(replace(found, directory=None, rows=())))
-    decision = None if found.decision is None else found.decision.tolist()
-    summary = {**summary, "rows": [finite(row) for row in rows], "decision": decision}
-    return {"format": 1} | {name: value for name, value in summary.items() if name != "directory"}
-
-
-def _to_plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray) else value
+def envelopes(bound: Bound) -> dict[str, Array]:
+    """Return the bounds of every worst case along its window, as arrays."""
+    return {f"{name}{i}": getattr(row, name) for i, row in enumerate(bound.rows) for name in ENVELOPE}
 
 
 def list_bound_rows(found: Bound) -> list[tuple[str, ...]]:

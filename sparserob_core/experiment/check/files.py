@@ -16,6 +16,8 @@ from sparserob_core.checker.sets.shape import excess
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.finished import ANSWERS, StoredRun
 from sparserob_core.experiment.directory.sparsity import sparsity
+from sparserob_core.quantities import statistics
+from sparserob_core.sip.result import Result
 
 if TYPE_CHECKING:
     from sparserob_core.checker.claims.case import Case
@@ -76,13 +78,11 @@ def compare_program(stored: StoredRun, data: Mapping[str, Any], summary: Mapping
     ``n`` is the number of entries of its decision.
     """
     comparison = Compared()
-    lower = summary.get("lower_bound")
-    pairs = {key: (summary.get(key), data.get(key)) for key in ("status", "cost")}
-    pairs["lower_bound"] = (None if lower == -np.inf else lower, data.get("lower_bound"))
+    claims = [name for name, entry in statistics(Result).items() if entry.certified == name]
     different = [
-        f"{key} is {summarised!r}, the certificate says {certified!r}"
-        for key, (summarised, certified) in pairs.items()
-        if summarised != certified
+        f"{name} is {summary.get(name)!r}, the certificate says {data.get(name)!r}"
+        for name in claims
+        if summary.get(name) != data.get(name)
     ]
     text = "status, cost and lower bound are those of the certificate"
     comparison.claims.append(Finding("result.json", "fails" if different else "holds", "; ".join(different) or text))
@@ -221,16 +221,19 @@ Verdicts = tuple[list[str], str, list[str]]
 """The differences, the sentence where there are none, and the names of entries that were not compared."""
 
 
-def _compare_result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
-    """Compare ``result.json`` key by key."""
+def _compare_result(loaded: Loaded, case: Case, summary: Mapping[str, Any], kind: type[Result] = Result) -> Verdicts:
+    """Compare ``result.json`` key by key; ``kind`` is the class of the result."""
     from sparserob_core.checker.outcome import Unchecked
 
     status = case.certificate.get("status")
-    expected_values = {
-        "status": (status,),
-        "lower_bound": (case.certificate.get("lower_bound"),),
+    expected_values: dict[str, tuple[object, ...]] = {
+        **{
+            name: (case.certificate.get(entry.certified),)
+            for name, entry in statistics(kind).items()
+            if entry.certified
+        },
         "config": (case.certificate.get("config"),),
-        "cost": (None if status == "infeasible" else case.certificate.get("cost"),),
+        **({"cost": (None,)} if status == "infeasible" else {}),
         "upper_bound": {
             "infeasible": (None,),
             "refuted": (None,),

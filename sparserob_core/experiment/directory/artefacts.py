@@ -8,6 +8,7 @@ import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
@@ -195,10 +196,19 @@ def trace_columns(history: Sequence[RoundFinished]) -> dict[str, Any]:
     return {name: np.array([getattr(entry, name) for entry in history]) for name in plain}
 
 
+UNWRITTEN: Mapping[str, object] = {"written": False}
+"""The metadata of a field of a record that no JSON file has."""
+
+
 def finite(data: Any) -> Any:
-    """Return data in a form that JSON can hold: null for numbers that are not finite, and lists for arrays."""
+    """Return data in a form that JSON can hold: null for numbers that are not finite, and lists for arrays.
+
+    A record has every field but those that are `UNWRITTEN`.
+    """
     if isinstance(data, Mapping):
         return {str(key): finite(value) for key, value in data.items()}
+    if is_dataclass(data):
+        return {entry.name: finite(getattr(data, entry.name)) for entry in fields(data) if entry.metadata != UNWRITTEN}
     if isinstance(data, np.ndarray | np.generic):
         return finite(data.tolist())
     if isinstance(data, list | tuple):

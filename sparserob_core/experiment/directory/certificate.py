@@ -15,6 +15,7 @@ from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.control.transcription.program import slanted_sides
 from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, PlainExperiment
+from sparserob_core.quantities import statistics
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Activity, Branch, Dual, Proof
 from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram
@@ -103,9 +104,7 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     return {
         "format": FORMAT,
         "config": experiment.loaded.config.digest(),
-        "status": result.status,
-        "cost": result.cost,
-        "lower_bound": result.lower_bound,
+        **_write_claims(result),
         "gap_tolerance": experiment.gap_tolerance,
         **({"repeat": True} if experiment.transcription.problem.repeat else {}),
         "decision": theta,
@@ -137,9 +136,7 @@ def _certify_program(experiment: PlainExperiment, result: Result) -> dict[str, A
     return {
         "format": FORMAT,
         "config": experiment.loaded.config.digest(),
-        "status": result.status,
-        "cost": result.cost,
-        "lower_bound": result.lower_bound if np.isfinite(result.lower_bound) else None,
+        **_write_claims(result),
         "gap_tolerance": experiment.gap_tolerance,
         "decision": result.decision,
         "multipliers": None
@@ -162,13 +159,16 @@ def bare_certificate(experiment: Experiment, result: Result) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "config": experiment.loaded.config.digest(),
-        "status": result.status,
-        "cost": result.cost,
-        "lower_bound": result.lower_bound,
+        **_write_claims(result),
         "decision": None,
         "multipliers": None,
         "proof": {},
     }
+
+
+def _write_claims(result: Result) -> dict[str, Any]:
+    """Return the statistics of a result that its certificate claims."""
+    return {name: getattr(result, name) for name, entry in statistics(type(result)).items() if entry.certified == name}
 
 
 def _find_ranges(row: np.ndarray) -> list[list[int]]:

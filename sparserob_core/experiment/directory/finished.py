@@ -20,18 +20,18 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.matrices.arrays import read_arrays
 from sparserob_core.experiment.directory.rounds import BOUND, CUTS, FORMULATIONS, cuts_of, with_decisions
+from sparserob_core.quantities import statistics
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.program import Formulation
-from sparserob_core.sip.result import COLUMNS, MEANING, SearchTrace
+from sparserob_core.sip.result import COLUMNS, MEANING, Result, SearchTrace
 
 if TYPE_CHECKING:
     from sparserob_core.experiment.assemble import ControlExperiment, Experiment
     from sparserob_core.experiment.config.load import Loaded
 
 UNFINISHED = "the run has not finished"
-NUMBERS = ("cost", "value", "epsilon", "lower_bound", "upper_bound", "gap", "seconds")
 # arrays of a feedback decision: gains, the observer where outputs are measured, and the gains of an inner loop
 ANSWERS = ("gains", "observer", "prestabilise")
 # Difference that is allowed between dependent arrays, as a share of the largest number of the array
@@ -415,13 +415,16 @@ def read_summary(file: Path) -> dict[str, Any]:
     status = summary.get("status")
     if not isinstance(status, str) or status not in MEANING:
         raise InputError(f"{file}: expected the result of a run, with a status ({', '.join(MEANING)}), got {status!r}")
-    for name in NUMBERS:
-        value = summary.setdefault(name)
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
+    for name, described in statistics(Result).items():
+        empty = None if described.unit else ""
+        value = summary.get(name, empty) if described.recent else summary.setdefault(name, empty)
+        if not described.unit:
+            if not isinstance(value, str):
+                raise InputError(f"{file}: {name}: expected text, got {value!r}")
+        elif value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
             raise InputError(f"{file}: {name}: expected a number or null, got {value!r}")
-    for name in ("title", "message"):
-        if not isinstance(summary.setdefault(name, ""), str):
-            raise InputError(f"{file}: {name}: expected text, got {summary[name]!r}")
+    if not isinstance(summary.setdefault("title", ""), str):
+        raise InputError(f"{file}: title: expected text, got {summary['title']!r}")
     for name in ("worst", "sparsity", "counts"):
         if not isinstance(summary.setdefault(name, {}), dict):
             raise InputError(f"{file}: {name}: expected an object, got {summary[name]!r}")

@@ -21,6 +21,7 @@ from sparserob_core.control.transcription.program import EQUALS
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.experiment.directory.rounds import BOUND
 from sparserob_core.experiment.directory.sparsity import sparsity, verdict
+from sparserob_core.quantities import statistics
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut, Proof
 from sparserob_core.sip.program import TOLERANCE, EqualityErrors, SemiInfiniteProgram, WorstConstraint
@@ -39,18 +40,15 @@ def summary_of(result: Result, control: Array | None, model: Transcription | Non
     acting = asdict(sparsity(control, model.control.breakpoints)) if control is not None and model is not None else None
     units = {} if model is None else units_of(model, result)
     parameters = () if model is None or model.problem.system.parameters is None else model.problem.system.names
+    is_proven = result.status in PROVEN
+    numbers = dict[str, Any]()
+    for name, described in statistics(type(result)).items():
+        numbers[name] = getattr(result, name) if is_proven or not described.proven else None
+        if name == "cost" and result.sparsest is not None and result.decision is not None:
+            numbers["J"] = result.sparsest.norm
+    seconds = numbers.pop("seconds")
     return {
-        "status": result.status,
-        "message": result.message,
-        "cost": result.cost,
-        **({} if result.sparsest is None or result.decision is None else {"J": result.sparsest.norm}),
-        "value": result.value,
-        "epsilon": result.epsilon,
-        "lower_bound": result.lower_bound,
-        "upper_bound": result.upper_bound if result.status in PROVEN else None,
-        "gap": result.gap if result.status in PROVEN else None,
-        "cost_scale": result.cost_scale,
-        "stopped": result.stopped,
+        **numbers,
         "worst": _report_worst(result.worst, None if model is None else model.stated.system.states),
         **({"units": units} if units else {}),
         **({"parameters": list(parameters)} if parameters else {}),
@@ -72,7 +70,7 @@ def summary_of(result: Result, control: Array | None, model: Transcription | Non
             **({"solved_by": dict(result.solved_by)} if result.solved_by else {}),
         },
         **({} if result.scenario_bound is None else {"scenario_bound": asdict(result.scenario_bound)}),
-        "seconds": result.seconds,
+        "seconds": seconds,
     }
 
 

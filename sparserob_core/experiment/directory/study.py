@@ -35,18 +35,3 @@ def open_directory(loaded: Loaded, out: str | Path | None, heading: str, kind: s
     with create_directory(out, f"{name_of(loaded)}{kind}", loaded.config.digest()) as directory:
         directory.write_text("config.yaml", write_yaml(loaded.config.plain(), heading))
         yield directory
-
-
-@contextmanager
-def open_study(
-    loaded: Loaded, out: str | Path | None, heading: str, kind: str, write: bool
-) -> Iterator[RunDirectory | None]:
-    """Make the directory of a study as `open_directory` does, or yield ``None`` where nothing is to be written.
-
-    Without ``out`` a directory is made only where ``write`` is true.
-    """
-    if out is None and not write:
-        yield None
-        return
-    with open_directory(loaded, out, heading, kind) as directory:
-        yield directory

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal, final
 
 import numpy as np
@@ -13,6 +14,7 @@ from sparserob_core.brief import brief
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.studies.polygon_approximation import inside, polygon_area
 from sparserob_core.errors import InputError
+from sparserob_core.quantities import quantities, quantity
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.result import Status
 
@@ -40,25 +42,26 @@ class InitialStates:
     measured in, where that is known. ``limit``: the bound on the coordinates where one was asked for, and ``cut``
     whether it cuts the set. ``status``: ``certified`` (the polygons differ by at most a thousandth of the area),
     ``verified`` (by more), ``infeasible`` (the set is empty, proven) or ``undecided`` (no point is proven).
+    ``directory``: where its files are, if there are any.
     """
 
     title: str
     states: tuple[int, int]
     status: Status
     message: str
-    inner: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    outer: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    controls: Array = field(default_factory=lambda: np.zeros((0, 0, 0)), repr=False)
-    gains: Array = field(default_factory=lambda: np.zeros((0, 0, 0, 0, 0)), repr=False)
-    inner_gains: Array = field(default_factory=lambda: np.zeros((0, 0, 0)), repr=False)
-    directions: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
-    bounds: Array = field(default_factory=lambda: np.zeros(0), repr=False)
-    reached: Array = field(default_factory=lambda: np.zeros(0), repr=False)
-    points: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
-    costs: Array = field(default_factory=lambda: np.zeros(0), repr=False)
-    lower_bounds: Array = field(default_factory=lambda: np.zeros(0), repr=False)
-    origin: Array = field(default_factory=lambda: np.zeros(0))
-    path: Sequence[Array] = field(default=(), repr=False)
+    inner: Array = field(default_factory=lambda: np.zeros((0, 2)), metadata=quantity("plane"))
+    outer: Array = field(default_factory=lambda: np.zeros((0, 2)), metadata=quantity("plane"))
+    controls: Array = field(default_factory=lambda: np.zeros((0, 0, 0)), repr=False, metadata=quantity("controls"))
+    directions: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False, metadata=quantity("normals"))
+    bounds: Array = field(default_factory=lambda: np.zeros(0), repr=False, metadata=quantity("bounds"))
+    reached: Array = field(default_factory=lambda: np.zeros(0), repr=False, metadata=quantity("bounds"))
+    points: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False, metadata=quantity("plane"))
+    costs: Array = field(default_factory=lambda: np.zeros(0), repr=False, metadata=quantity("cost"))
+    lower_bounds: Array = field(default_factory=lambda: np.zeros(0), repr=False, metadata=quantity("cost"))
+    origin: Array = field(default_factory=lambda: np.zeros(0), metadata=quantity("states"))
+    gains: Array = field(default_factory=lambda: np.zeros((0, 0, 0, 0, 0)), repr=False, metadata=quantity("gains"))
+    inner_gains: Array = field(default_factory=lambda: np.zeros((0, 0, 0)), repr=False, metadata=quantity("gains"))
+    path: Sequence[Array] = field(default=(), repr=False, metadata=quantity("plane"))
     called: Names = UNNAMED
     cost_unit: str = ""
     limit: float | None = None
@@ -66,6 +69,7 @@ class InitialStates:
     remarks: Sequence[str] = ()
     programs: int = 0
     seconds: float = 0.0
+    directory: Path | None = field(default=None, repr=False)
 
     __repr__ = brief
 
@@ -165,20 +169,8 @@ class InitialStates:
 
     def arrays(self) -> Mapping[str, Array]:
         """``initial_states.npz``."""
-        names = (
-            "inner",
-            "outer",
-            "controls",
-            "directions",
-            "bounds",
-            "reached",
-            "points",
-            "costs",
-            "lower_bounds",
-            "origin",
-        )
-        answers = [name for name in ("gains", "inner_gains") if getattr(self, name).size]
-        return {name: getattr(self, name) for name in (*names, *answers)}
+        arrays = {name: getattr(self, name) for name in quantities(InitialStates) if name != "path"}
+        return {name: array for name, array in arrays.items() if array.size or not name.endswith("gains")}
 
     def rows(self) -> list[tuple[str, str]]:
         """Return the main results for a user, as rows of a table."""

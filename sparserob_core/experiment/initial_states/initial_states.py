@@ -18,12 +18,12 @@ from sparserob_core.control.transcription.transcribe import from_state, in_own_u
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import assemble, tools_of, transcribed_by
 from sparserob_core.experiment.config.load import Loaded, load_config
-from sparserob_core.experiment.directory.artefacts import RunDirectory
-from sparserob_core.experiment.directory.study import open_study
 from sparserob_core.experiment.initial_states.feasible_set import ON_EDGE, InitialStates
 from sparserob_core.experiment.initial_states.search import InitialStatesSearch
 from sparserob_core.experiment.initial_states.section import section
 from sparserob_core.experiment.run.given import GivenConfig, as_config
+from sparserob_core.experiment.study.kit import open_study, write_study
+from sparserob_core.quantities import Unit, in_units
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.method import GAP_TOLERANCE
@@ -57,6 +57,8 @@ def initial_states(
     ``limits.seconds`` of the config, end the search with what it has proven by then. Raises
     `InputError` when an argument or the config is at fault, and when the set is unbounded.
     """
+    from sparserob_core.experiment.initial_states.figure import draw_initial_states
+
     whole("directions", directions, 4)
     whole("values", values, 0)
     limit = _check_limit(within)
@@ -89,32 +91,29 @@ def initial_states(
         feasible_set = search.states(experiment.title, directions, values)
         feasible_set = replace(feasible_set, path=_intersect_path_sets(own.problem, feasible_set))
         result = _convert_to_user_units(feasible_set, units, limit)
-        return result if directory is None else _write_files(directory, result)
+        if directory is None:
+            return result
+        draw = draw_initial_states if result.outer.shape[0] else None
+        arrays = {"initial_states.npz": result.arrays()}
+        return write_study(directory, "initial_states", result, draw, arrays=arrays)
 
 
 def _convert_to_user_units(own: InitialStates, units: Units, limit: float | None) -> InitialStates:
     """Convert results from the problem's own units to the user's units; ``limit`` is the bound that the user gave."""
-    x, per_state = units.states[list(own.states)], units.controls[:, None] / units.states
-    normals, outer = own.directions / x, own.outer * x
-    norms = np.linalg.norm(normals, axis=1)
-    return replace(
-        own,
-        inner=own.inner * x,
-        outer=outer,
-        controls=own.controls * units.controls[:, None] if own.controls.size else own.controls,
-        gains=own.gains * per_state if own.gains.size else own.gains,
-        inner_gains=own.inner_gains * per_state if own.inner_gains.size else own.inner_gains,
-        directions=normals / norms[:, None],
-        bounds=own.bounds / norms,
-        reached=own.reached / norms,
-        points=own.points * x,
-        costs=own.costs * units.cost,
-        lower_bounds=own.lower_bounds * units.cost,
-        origin=own.origin * units.states,
-        path=tuple(polygon * x for polygon in own.path),
-        limit=limit,
-        cut=limit is not None and bool((np.abs(outer) >= limit * (1.0 - ON_EDGE)).any()),
-    )
+    x = units.states[list(own.states)]
+    norms = np.linalg.norm(own.directions / x, axis=1)
+    measured: dict[str, Unit] = {
+        "plane": x,
+        "states": units.states,
+        "controls": units.controls[:, None],
+        "gains": lambda gains: gains * units.controls[:, None] / units.states,
+        "normals": lambda normals: normals / x / norms[:, None],
+        "bounds": lambda bounds: bounds / norms,
+        "cost": units.cost,
+    }
+    result = in_units(own, measured)
+    is_cut = limit is not None and bool((np.abs(result.outer) >= limit * (1.0 - ON_EDGE)).any())
+    return replace(result, limit=limit, cut=is_cut)
 
 
 def _check_limit(within: object) -> float | None:
@@ -171,16 +170,3 @@ def _intersect_path_sets(problem: OptimalControlProblem, found: InitialStates) -
         polygon = section(entry.set, found.origin - offset, found.states, middle - offset[states], view)
         polygons.append(polygon + offset[states])
     return tuple(polygons)
-
-
-def _write_files(directory: RunDirectory, found: InitialStates) -> InitialStates:
-    """Write the files of a set of initial states; a figure that cannot be drawn is a remark."""
-    from sparserob_core.experiment.figures.style import draw_extra
-    from sparserob_core.experiment.initial_states.figure import draw_initial_states
-
-    if found.outer.shape[0]:
-        remarks = draw_extra(directory.path / "initial_states.png", draw_initial_states, found)
-        found = replace(found, remarks=(*found.remarks, *remarks))
-    directory.write_json("initial_states.json", found.summary())
-    directory.write_arrays("initial_states.npz", found.arrays())
-    return found

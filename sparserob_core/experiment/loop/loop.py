@@ -22,14 +22,14 @@ from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.adversary import adversaries
-from sparserob_core.experiment.directory.artefacts import RunDirectory, require_room
-from sparserob_core.experiment.directory.finished import FinishedRun, read_finished
+from sparserob_core.experiment.directory.finished import FinishedRun
 from sparserob_core.experiment.loop.controller import controller
 from sparserob_core.experiment.loop.study import ClosedLoops
 from sparserob_core.experiment.run.events import StudyProgress
-from sparserob_core.experiment.run.given import GivenRun, as_run
+from sparserob_core.experiment.run.given import GivenRun
 from sparserob_core.experiment.simulation.simulation import ADVERSARY, LAWS
 from sparserob_core.experiment.simulation.violations import ViolationCount
+from sparserob_core.experiment.study.kit import open_run, write_into_run
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.program import TOLERANCE
@@ -95,31 +95,20 @@ def loop(
         If the directory is no finished run with a proven control, or another argument is at fault. It is raised before
         anything is written.
     """
-    from sparserob_core.experiment.figures.drawing import stored_figure_data
-    from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable, save_figure
     from sparserob_core.experiment.loop.figure import draw_loops
 
     count = (RESOLVED_LOOPS if resolve else LOOPS) if trajectories is None else whole("trajectories", trajectories, 1)
     whole("seed", seed, 0)
     whole("periods", periods, 1)
-    if out is not None:
-        require_writable(Path(out))
     start = clock.perf_counter()
-    directory, experiment = as_run(run)
-    finished = read_finished(directory, plugins, experiment)
-    require_room(finished.directory)
+    finished = open_run(run, plugins, out)
     if periods > 1 and not finished.experiment.transcription.problem.repeat:
         raise InputError(f"periods: expected 1 of a plan that ends at its horizon, or problem.repeat, got {periods}")
     acting = controller(run, resolve, seconds=seconds, plugins=plugins)
     loops = replace(
         _simulate_loops(finished, acting, resolve, (count, periods), seed, notify), seconds=clock.perf_counter() - start
     )
-    RunDirectory(finished.directory).write_json("loop.json", loops.summary())
-    if out is not None and (missing := missing_matplotlib()):
-        return replace(loops, undrawn=missing)
-    if out is not None:
-        save_figure(Path(out), draw_loops, loops, stored_figure_data(finished))
-    return loops
+    return write_into_run(finished, "loop", loops, out, draw_loops, loops)
 
 
 def _simulate_loops(

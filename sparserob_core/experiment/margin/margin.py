@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,6 @@ from sparserob_core.errors import InputError, named
 from sparserob_core.experiment.assemble import assemble, tools_of, transcribed_by
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.problems import ProblemKeys
-from sparserob_core.experiment.directory.artefacts import RunDirectory, finite
-from sparserob_core.experiment.directory.study import open_study
 from sparserob_core.experiment.margin.causal import causal_upper
 from sparserob_core.experiment.margin.horizon import HORIZON, HorizonSearch, horizon_search
 from sparserob_core.experiment.margin.points import MarginPoint, Points
@@ -25,13 +23,14 @@ from sparserob_core.experiment.margin.scaling import scaling
 from sparserob_core.experiment.margin.search import Margin, MarginSearch
 from sparserob_core.experiment.run.events import Broadcast, Observer, SweepFinished, SweepStarted
 from sparserob_core.experiment.run.given import GivenConfig, as_config
+from sparserob_core.experiment.study.kit import open_study, write_study
 from sparserob_core.sip.events import Event, Notify, ignore
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.relaxed.parametric import ParametricProgram
 from sparserob_core.sip.result import Result
 
-__all__ = ["Margin", "MarginPoint", "margin", "margin_rows", "summary_of_margin"]
+__all__ = ["Margin", "MarginPoint", "margin", "margin_rows"]
 
 
 def margin(
@@ -111,7 +110,7 @@ def margin(
             broadcast(_make_start_event(search, Path() if directory is None else directory.path))
             result = search.margin(int(curve))
             if directory is not None:
-                result = _write_files(directory, result, search)
+                result = write_study(directory, "margin", result, *_choose_figure(result, search))
         answer, stopped = "; ".join(f"{name}: {value}" for name, value in margin_rows(result)[:3]), deadline.reason
         return result
     except BaseException as error:
@@ -137,13 +136,6 @@ def _make_start_event(search: MarginSearch | HorizonSearch, directory: Path) -> 
         arrangement="search",
         sense=scaled.sense if scaled is not None and scaled.nested else "",
     )
-
-
-def summary_of_margin(found: Margin) -> dict[str, Any]:
-    """Return the contents of ``margin.json``: every field but the directory, with null for numbers that are not
-    finite."""
-    summary: dict[str, Any] = finite(asdict(replace(found, directory=None)))
-    return {name: value for name, value in summary.items() if name != "directory"}
 
 
 def margin_rows(found: Margin) -> list[tuple[str, str]]:
@@ -274,18 +266,10 @@ def _choose_method(loaded: Loaded) -> Exchange:
     return built if isinstance(built, Exchange) else Exchange()
 
 
-def _write_files(directory: RunDirectory, found: Margin, search: MarginSearch | HorizonSearch) -> Margin:
-    """Write the files of a margin, and return it with its directory; a figure that cannot be drawn is a warning."""
-    from sparserob_core.experiment.figures.style import draw_extra
+def _choose_figure(margin: Margin, search: MarginSearch | HorizonSearch) -> tuple[Any, ...]:
+    """Return the function that draws a margin, if there is anything to draw, and its further arguments."""
     from sparserob_core.experiment.margin.figure import draw_horizons, draw_margin
 
-    if len(found.curve) > 1:
-        file = directory.path / "margin.png"
-        remarks = (
-            draw_extra(file, draw_horizons, found)
-            if isinstance(search, HorizonSearch)
-            else draw_extra(file, draw_margin, found, search.scaling)
-        )
-        found = replace(found, remarks=(*found.remarks, *remarks))
-    directory.write_json("margin.json", summary_of_margin(found))
-    return replace(found, directory=directory.path)
+    if len(margin.curve) < 2:
+        return (None,)
+    return (draw_horizons,) if isinstance(search, HorizonSearch) else (draw_margin, search.scaling)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypeAlias, final
+from typing import Any, Literal, TypeAlias, final
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from sparserob_core.brief import brief
 from sparserob_core.control.loop.resolving import shift_cuts
 from sparserob_core.control.studies.causal import Ended
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.directory.artefacts import UNWRITTEN, finite
 from sparserob_core.experiment.margin.critical import Critical, critical_factor
 from sparserob_core.experiment.margin.points import MarginPoint, Points
 from sparserob_core.experiment.margin.scaling import Scaling, Sense
@@ -115,11 +116,15 @@ class Margin:
     curve: tuple[MarginPoint, ...] = ()
     remarks: tuple[str, ...] = ()
     seconds: float = 0.0
-    directory: Path | None = None
+    directory: Path | None = field(default=None, metadata=UNWRITTEN)
     covered: tuple[tuple[float, float], ...] = ()
     causal_upper: float = np.nan
     causal_ended: Ended | None = None
     cost_unit: str = ""
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of ``margin.json``: every field but the directory."""
+        return dict(finite(self))
 
     __repr__ = brief
 

@@ -16,6 +16,7 @@ from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.landscape import deciding_again
 from sparserob_core.experiment.run.viewer import recorded, recorder
 from sparserob_core.experiment.terminal.printing import printable
+from sparserob_core.quantities import statistics
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import DECIDING, Batch, EvaluationsFinished
 from sparserob_core.sip.evidence import Dual, Proof
@@ -138,19 +139,11 @@ def stored_result(run: StoredRun) -> Result:
     decision = solution.get("decision", np.zeros(0))
     try:
         return Result(
-            status=summary["status"],
-            message=summary["message"],
+            **_read_statistics(summary),
             decision=decision if decision.size else None,
-            cost=_get_number(summary, "cost"),
-            value=_get_number(summary, "value"),
-            epsilon=_get_number(summary, "epsilon"),
-            lower_bound=_get_number(summary, "lower_bound", -np.inf),
-            upper_bound=_get_number(summary, "upper_bound", np.inf),
-            cost_scale=_get_number(summary, "cost_scale", 0.0),
-            stopped=str(summary.get("stopped") or ""),
             worst=_read_worst(summary["worst"], solution),
             proofs=[
-                Proof(str(name), "proven", _get_number(tolerance, "proven"))
+                Proof(str(name), "proven", float(np.nan if tolerance.get("proven") is None else tolerance["proven"]))
                 for name, tolerance in summary.get("tolerances", {}).items()
             ],
             counts={str(name): int(count) for name, count in summary["counts"].items() if isinstance(count, int)},
@@ -161,7 +154,6 @@ def stored_result(run: StoredRun) -> Result:
             dual=Dual(-np.inf, *run.proving),
             history=run.history,
             trace=run.evaluations,
-            seconds=_get_number(summary, "seconds", 0.0),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
@@ -188,8 +180,13 @@ def _read_worst(said: Mapping[str, Any], solution: Mapping[str, Array]) -> Worst
     )
 
 
-def _get_number(summary: Mapping[str, Any], name: str, missing: float = np.nan) -> float:
-    return missing if summary.get(name) is None else float(summary[name])
+def _read_statistics(summary: Mapping[str, Any], kind: type[Result] = Result) -> dict[str, Any]:
+    """Return the fields of a result that are statistics; those that are null or not written have their defaults."""
+    return {
+        name: float(summary[name]) if described.unit else str(summary[name])
+        for name, described in statistics(kind).items()
+        if not described.after and summary.get(name) is not None
+    }
 
 
 def _replay_searches(trace: SearchTrace, inspection: Inspection) -> Iterator[tuple[int, EvaluationsFinished]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -32,11 +31,10 @@ from sparserob_core.experiment.directory.adversary import (
     propagated,
     read_adversaries,
 )
-from sparserob_core.experiment.directory.artefacts import RunDirectory, require_room
-from sparserob_core.experiment.directory.finished import FinishedRun, read_finished
+from sparserob_core.experiment.directory.finished import FinishedRun
 from sparserob_core.experiment.plugins.messages import nearest
 from sparserob_core.experiment.run.events import StudyProgress
-from sparserob_core.experiment.run.given import GivenRun, as_run
+from sparserob_core.experiment.run.given import GivenRun
 from sparserob_core.experiment.simulation.simulation import (
     ADVERSARY,
     ANY,
@@ -46,6 +44,7 @@ from sparserob_core.experiment.simulation.simulation import (
     clopper_pearson,
 )
 from sparserob_core.experiment.simulation.violations import ViolationCount
+from sparserob_core.experiment.study.kit import open_run, write_into_run
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.program import TOLERANCE
@@ -98,16 +97,10 @@ def simulate(
         anything is written.
     """
     from sparserob_core.experiment.figures.adversary_figure import draw_adversary
-    from sparserob_core.experiment.figures.drawing import stored_figure_data
-    from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable, save_figure
     from sparserob_core.experiment.simulation.figure import draw_simulation
 
     count = _check_arguments(law, trajectories, seed)
-    if out is not None:
-        require_writable(Path(out))
-    directory, experiment = as_run(run)
-    finished = read_finished(directory, plugins, experiment)
-    require_room(finished.directory)
+    finished = open_run(run, plugins, out)
     model = finished.experiment.transcription
     if not model.constraints:
         raise InputError(
@@ -131,14 +124,8 @@ def simulate(
         simulation = _replay_worst_cases(finished, replayed, started)
     else:
         simulation = _simulate_samples(finished, worst, cast(LawName, law), count, seed, notify, started)
-    RunDirectory(finished.directory).write_json(f"simulation-{law}.json", simulation.summary())
-    if out is not None and (missing := missing_matplotlib()):
-        return replace(simulation, undrawn=missing)
-    if out is not None and replayed is not None:
-        save_figure(Path(out), draw_adversary, replayed, stored_figure_data(finished))
-    elif out is not None:
-        save_figure(Path(out), draw_simulation, simulation, stored_figure_data(finished))
-    return simulation
+    draw, drawn = (draw_simulation, simulation) if replayed is None else (draw_adversary, replayed)
+    return write_into_run(finished, f"simulation-{law}", simulation, out, draw, drawn)
 
 
 def _simulate_samples(

@@ -14,18 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from sparserob_core.errors import InputError
+from sparserob_core.quantities import statistics
+from sparserob_core.sip.result import Result
 
 TABLE, COLUMNS = "table.csv", "columns.csv"
 Row = dict[str, Any]
+LAST = ("stopped", "message", "run", "hash", "seconds")
+"""Columns at the end; ``seconds`` is the last one, as no other column differs when a study is repeated."""
 FIRST = (
-    "status",
-    "cost",
-    "value",
-    "epsilon",
-    "lower_bound",
-    "upper_bound",
-    "gap",
-    "cost_scale",
     "worst.violation",
     "worst.constraint",
     "worst.time",
@@ -35,18 +31,9 @@ FIRST = (
     "sparsity.fewest_active.lower",
     "sparsity.fewest_active.upper",
 )
-LAST = ("stopped", "message", "run", "hash", "seconds")
-"""Columns at the end; ``seconds`` is the last one, as no other column differs when a study is repeated."""
+"""Columns that every run has, after the statistics of a result."""
 LEFT = frozenset({"title", "versions", "provenance", "config", "tolerances", "units", "worst.parameter", "seed"})
 MEANING = {
-    "status": ("", "what was proven; see method.md"),
-    "cost": ("cost", "J of the returned control, without the regulariser"),
-    "value": ("cost", "J and the weighted regulariser"),
-    "epsilon": ("1", "weight of the regulariser that was solved"),
-    "lower_bound": ("cost", "proven lower bound of the least cost"),
-    "upper_bound": ("cost", "proven upper bound; empty unless the status is certified or verified"),
-    "gap": ("1", "relative distance of the bounds"),
-    "cost_scale": ("cost", "what is added up to the cost"),
     "worst.violation": ("constraint", "by how much the worst constraint is exceeded; negative: a margin"),
     "worst.constraint": ("", "which constraint that is"),
     "worst.time": ("time", "when"),
@@ -58,14 +45,14 @@ MEANING = {
     "units.cost": ("", "what the cost and its bounds are measured in, where the names of the config tell"),
     "units.worst": ("", "what the worst violation is measured in, where the names of the config tell"),
     "units.time": ("", "what times are measured in, where the names of the config tell"),
-    "stopped": ("", "the limit that ended the run early"),
-    "message": ("", "the result in a sentence, or why there is none"),
     "run": ("", "the run's directory below runs"),
     "hash": ("", "SHA-256 of the run's config, without where it was solved, who watched, its title and its limits"),
-    "seconds": ("s", "what the method took"),
 }
-"""Unit and meaning of the columns. ``cost``, ``constraint`` and ``time`` stand for the units of the config; the columns
-of `UNITS` have those that it names."""
+"""Unit and meaning of the other columns. ``cost``, ``constraint`` and ``time`` stand for the units of the config; the
+columns of `UNITS` have those that it names."""
+TEXTS = {name for name, (unit, _) in MEANING.items() if not unit}
+TEXTS |= {name for name, entry in statistics(Result).items() if not entry.unit}
+"""Columns that are text, whatever it looks like."""
 UNITS = {"cost": "units.cost", "constraint": "units.worst", "time": "units.time"}
 TIMES = frozenset({"horizon", "from", "to", "delay", "latency"})
 """Keys whose values are times, anywhere in a config's problem."""
@@ -134,12 +121,14 @@ def _list_entries(name: str, value: Any) -> Iterator[tuple[str, Any]]:
             yield f"{name}.{key}", entry
 
 
-def columns_of(axes: Sequence[str], rows: Iterable[Row]) -> list[str]:
+def columns_of(axes: Sequence[str], rows: Iterable[Row], kind: type[Result] = Result) -> list[str]:
     """Return the columns of a table.
 
     First come the axes, each followed by its entries where it has some. The columns that every run has follow in a
-    fixed order, then the others by name, and the last ones.
+    fixed order, first the statistics of its result, which has the class ``kind``. Then come the others by name, and the
+    last ones.
     """
+    first = [*(name for name in statistics(kind) if name not in LAST), *FIRST]
     kept = list(rows)
     entries = {
         axis: max((sum(_find_axis(name, axes) == axis for name in row) for row in kept), default=0) for axis in axes
@@ -151,8 +140,8 @@ def columns_of(axes: Sequence[str], rows: Iterable[Row]) -> list[str]:
         if name == axis or name not in axes
     ]
     run_columns = {name for row in kept for name in row} - set(axis_columns)
-    other_columns = sorted(run_columns - {*FIRST, *LAST})
-    return [*axis_columns, *(name for name in (*FIRST, *other_columns, *LAST) if name not in axis_columns)]
+    other_columns = sorted(run_columns - {*first, *LAST})
+    return [*axis_columns, *(name for name in (*first, *other_columns, *LAST) if name not in axis_columns)]
 
 
 def _find_axis(name: str, axes: Sequence[str]) -> str | None:
@@ -187,11 +176,12 @@ def axis_unit(key: str, rows: Iterable[Row]) -> str:
     return shared_unit(rows, "time") if first == "problem" and names and names[-1] in TIMES else ""
 
 
-def columns_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
+def columns_text(axes: Sequence[str], rows: Sequence[Row], kind: type[Result] = Result) -> str:
     """Return the unit and the meaning of every column, as CSV."""
     lines = [["column", "unit", "meaning"]]
-    for name in columns_of(axes, rows):
-        unit, meaning = MEANING.get(name, ("1", ""))
+    meanings = MEANING | {name: (entry.unit, entry.meaning) for name, entry in statistics(kind).items()}
+    for name in columns_of(axes, rows, kind):
+        unit, meaning = meanings.get(name, ("1", ""))
         if name in axes:
             unit, meaning = axis_unit(name, rows), "an axis: this key of the config"
         unit = (shared_unit(rows, unit) or unit) if unit in UNITS else unit
@@ -236,7 +226,7 @@ def _format_cell(value: object) -> str:
 def _parse_cell(name: str, cell: str) -> Any:
     if cell == "":
         return None
-    if name in ("message", "stopped", "run", "hash", "status", "worst.constraint", *UNITS.values()):
+    if name in TEXTS:
         return cell
     try:
         return json.loads(cell)

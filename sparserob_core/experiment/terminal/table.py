@@ -7,6 +7,8 @@ from typing import Any
 
 from sparserob_core.brief import ENTRIES
 from sparserob_core.experiment.terminal.printing import output, printable
+from sparserob_core.quantities import statistics
+from sparserob_core.sip.result import Result
 
 KNOWN = {"lower bound", "upper bound", "relative gap"}
 """Rows that are shown even where the value is unknown."""
@@ -45,17 +47,23 @@ def _write_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str
     output().write("\n".join(text) + "\n")
 
 
-def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the main facts of a finished run for a user, as rows of a table, from the contents of ``result.json``."""
+def result_rows(summary: Mapping[str, Any], kind: type[Result] = Result) -> list[tuple[str, str]]:
+    """Return the main facts of a finished run for a user, as rows of a table, from the contents of ``result.json``.
+
+    ``kind`` is the class of the result.
+    """
     worst, sparsity, counts = summary["worst"], summary["sparsity"], summary["counts"]
     units = summary.get("units") or {}
+    cost, *others = (
+        (described.label, _format_measured(summary.get(name), units.get(described.unit), described.form))
+        for name, described in statistics(kind).items()
+        if described.label
+    )
     rows = [
         ("status", f"{summary['status']}: {summary['message']}"),
-        ("cost", _format_cost(summary["cost"], units.get("cost"))),
+        cost,
         ("cost of", summary.get("cost_of") or "unknown"),
-        ("lower bound", _format_cost(summary["lower_bound"], units.get("cost"))),
-        ("upper bound", _format_cost(summary["upper_bound"], units.get("cost"))),
-        ("relative gap", _format_number(summary["gap"], ".2e")),
+        *others,
         ("any causal policy", _format_causal_bound(summary, units.get("cost"))),
         ("worst violation", _format_worst(worst, units, summary.get("parameters") or ())),
         (
@@ -66,7 +74,7 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("rounds", str(counts["rounds"])),
         ("solved by", _name_solvers(counts.get("solved_by"))),
         ("share of time active", _format_active_share(sparsity)),
-        ("J", _format_cost(summary.get("J"), units.get("J"))),
+        ("J", _format_measured(summary.get("J"), units.get("J"))),
         ("sparsest", sparsity.get("verdict") or "unknown"),
         ("fewest active", _format_fewest_active(sparsity.get("fewest_active"), sparsity.get("channels"))),
         ("switches", _format_number(sparsity["switches"], "d")),
@@ -112,9 +120,9 @@ def _format_fewest_active(known: Mapping[str, Any] | None, channels: int | None)
     return f"every admissible control acts at least {lower} of the time{mean}{above}"
 
 
-def _format_cost(value: float | None, unit: str | None) -> str:
-    """A cost with its unit, where both are known."""
-    return "unknown" if value is None else _format_quantity(value, unit or "", ".9g")
+def _format_measured(value: float | None, unit: str | None, form: str = ".9g") -> str:
+    """A number with its unit, where both are known."""
+    return "unknown" if value is None else _format_quantity(value, unit or "", form)
 
 
 def _format_causal_bound(summary: Mapping[str, Any], unit: str | None) -> str:
@@ -122,7 +130,7 @@ def _format_causal_bound(summary: Mapping[str, Any], unit: str | None) -> str:
     if summary.get("causal_infeasible"):
         return "none exists: proven"
     lower = summary.get("causal_lower_bound")
-    return "unknown" if lower is None else f"costs at least {_format_cost(lower, unit)}"
+    return "unknown" if lower is None else f"costs at least {_format_measured(lower, unit)}"
 
 
 def _format_number(value: Any, form: str) -> str:

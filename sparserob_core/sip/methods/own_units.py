@@ -8,12 +8,15 @@ twin to a method and brings everything that comes back, result and events, into 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import final
+from functools import partial
+from types import MappingProxyType
+from typing import Any, TypeVar, final
 
 import numpy as np
 
+from sparserob_core.quantities import RECORD, Seal, Unit, in_units
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import (
     EvaluationsFinished,
@@ -21,15 +24,13 @@ from sparserob_core.sip.events import (
     Notify,
     ProofProgress,
     RoundFinished,
-    Sketch,
     frozen,
     ignore,
 )
-from sparserob_core.sip.evidence import Cut, Dual, Leaf, Proof, Sparsest
+from sparserob_core.sip.evidence import Cut, Leaf, Proof
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.program import (
     ConstraintFamily,
-    EqualityErrors,
     Formulation,
     OwnUnits,
     SemiInfiniteProgram,
@@ -38,6 +39,7 @@ from sparserob_core.sip.program import (
 )
 from sparserob_core.sip.result import Result, SearchTrace, Status
 
+R = TypeVar("R")
 # Which of two results says more, the first of these that either has.
 ORDER: Sequence[Status] = ("certified", "infeasible", "verified", "refuted", "undecided", "failed")
 
@@ -94,113 +96,107 @@ class UsersUnits:
 
     def result(self, own: Result) -> Result:
         """A result of the program in its own units, in the user's."""
-        return replace(
-            own,
-            decision=None if own.decision is None else own.decision * self.decision,
-            cost=own.cost * self.cost,
-            value=own.value * self.cost,
-            lower_bound=own.lower_bound * self.cost,
-            upper_bound=own.upper_bound * self.cost,
-            cost_scale=own.cost_scale * self.cost,
-            ray=None if own.ray is None else own.ray * self.decision,
-            worst=None if own.worst is None else self._convert_witness(own.worst),
-            indices=self.cuts(own.indices),
-            history=tuple(self._convert_round(event) for event in own.history),
-            trace=None if own.trace is None else self._convert_trace(own.trace),
-            dual=self._convert_dual(own.dual, infeasible=own.status == "infeasible"),
-            proofs=tuple(self._convert_proof(proof) for proof in own.proofs),
-            sparsest=None if own.sparsest is None else self._convert_sparsest(own.sparsest),
-            errors=None if own.errors is None else self._convert_errors(own.errors),
-        )
-
-    def _convert_errors(self, own: EqualityErrors) -> EqualityErrors:
-        return replace(own, missed=own.missed * self.equalities, allowed=own.allowed * self.equalities)
-
-    def _convert_sparsest(self, own: Sparsest) -> Sparsest:
-        tree = [
-            replace(node, dual=self._convert_dual(node.dual, infeasible=not node.feasible))
-            if isinstance(node, Leaf)
-            else node
-            for node in own.tree
+        result = self._convert(own)
+        proofs = [
+            replace(proof, share=before.bound, unit=1.0, units=self._find_row_units(proof.family))
+            for before, proof in zip(own.proofs, result.proofs, strict=True)
         ]
-        plain = None if own.plain is None else own.plain * self.cost
-        return replace(own, norm=own.norm * self.cost, plain=plain, tree=tree)
+        return replace(result, proofs=tuple(proofs))
 
     def event(self, own: Event) -> Event:
         """An event of a method that works on the program in its own units, in the user's."""
-        if isinstance(own, RoundFinished):
-            return self._convert_round(own)
-        if isinstance(own, EvaluationsFinished):
-            return self._convert_evaluations(own)
-        if isinstance(own, ProofProgress):
-            before = self._convert_bound(own.family, own.bound_before)
-            return replace(own, bound=self._convert_bound(own.family, own.bound), bound_before=before)
-        return own
+        return self._convert(own)
+
+    def cuts(self, own: Sequence[Cut]) -> tuple[Cut, ...]:
+        """Constraints of the program in its own units, with their multipliers, in the user's."""
+        return tuple(self._convert(cut) for cut in own)
+
+    def _convert(self, own: R, above: Mapping[str, Unit] = MappingProxyType({}), seal: Seal = np.asarray) -> R:
+        """Convert a record and those in its fields; ``above`` has the units of the record that it is a field of."""
+        seal = frozen if isinstance(own, Event) else seal
+        units = {**(above or self._list_program_units()), **self._list_units(own)}
+
+        def convert_nested(nested: Any) -> Any:
+            if isinstance(nested, Mapping):
+                return {name: self._convert(record, units, seal) for name, record in nested.items()}
+            return self._convert(nested, units, seal)
+
+        units[RECORD] = convert_nested
+        return in_units(own, units, seal)
+
+    def _list_program_units(self) -> dict[str, Unit]:
+        """Return the units that all records have in common."""
+        return {
+            "cost": self.cost,
+            "value": self.cost,
+            "decision": self.decision,
+            "equalities": self.equalities,
+            "mu": lambda mu: mu * self.cost / self.equalities if mu.size == self.equalities.size else mu,
+            "z": self.cost / self.image,
+        }
+
+    def _list_units(self, own: object) -> dict[str, Unit]:
+        """Return the units of the fields of one record, as far as they are its own."""
+        match own:
+            case Result():
+                return {"value": 1.0 if own.status == "infeasible" else self.cost}
+            case Leaf():
+                return {"value": self.cost if own.feasible else 1.0}
+            case Cut():
+                index = self._find_index_units(own.family, own.formulation, own.index.size)
+                return {"index": index, "price": self._compute_price(own)}
+            case WorstConstraint():
+                index = self._find_index_units(own.constraint, own.formulation, own.index.size)
+                return {"index": index, "row": self._find_row_unit(own.constraint, own.row)}
+            case Proof():
+                size = next((np.shape(index)[-1] for index in (own.index, *(own.leaves or ())) if index is not None), 0)
+                index = self._find_index_units(own.family, own.formulation, size)
+                return {"index": index, "row": own.unit, "bound": partial(self._convert_bound, own.family)}
+            case ProofProgress():
+                return {"bound": partial(self._convert_bound, own.family)}
+            case SearchTrace():
+                width = own.points.shape[1]
+                block = max((family.index_set.dimension for family in self._list_searched_families(width)), default=1)
+                return {"index": self.tuple_units(width, block)}
+            case RoundFinished():
+                return self._list_round_units(own)
+            case EvaluationsFinished():
+                return self._list_evaluation_units(own)
+        return {}
+
+    def _list_round_units(self, own: RoundFinished) -> dict[str, Unit]:
+        worst = own.separations.get(own.worst_family)
+        row = int(worst.rows[0]) if worst is not None and worst.rows.size else 0
+        return {
+            "row": self._find_row_unit(own.worst_family, row),
+            "separations": lambda separations: {
+                name: in_units(separation, self._list_separation_units(name, separation))
+                for name, separation in separations.items()
+            },
+            "prices": np.array([self._compute_price(cut) for cut in own.imposed])[: own.multipliers.size],
+        }
+
+    def _list_separation_units(self, name: str, own: Separation) -> dict[str, Unit]:
+        rows = self._find_row_units(name)
+        return {
+            "index": self._find_index_units(name, own.formulation, own.indices.shape[1]),
+            "rows": 1.0 if rows is None else rows[own.rows],
+            "bound": 1.0 if rows is None else float(rows.max()),
+        }
+
+    def _list_evaluation_units(self, own: EvaluationsFinished) -> dict[str, Unit]:
+        size = own.best_point.size if own.domain is None else own.domain.dimension
+        units = self._find_index_units(own.family, "reduced", size) if own.family else self.tuple_units(size, own.block)
+        return {
+            "index": lambda points: points * units if points.shape[-1] == size else points,
+            "box": lambda box: Box(frozen(box.lower * units), frozen(box.upper * units)),
+            "value": 1.0 if own.family else self.cost,
+        }
 
     def _convert_bound(self, name: str, bound: float) -> float:
         """The least bound in the user's units that holds for every row of a family that is bounded in their own."""
-        family = self._find_family(name)
-        if family is None or family.row_units is None:
-            return bound
-        return bound * float(family.row_units.max() if bound > 0.0 else family.row_units.min())
-
-    def _convert_round(self, own: RoundFinished) -> RoundFinished:
-        decision = None if own.decision is None else frozen(own.decision * self.decision)
-        worst = own.separations.get(own.worst_family)
-        row = int(worst.rows[0]) if worst is not None and worst.rows.size else 0
-        multipliers = [m * self._compute_price(cut) for m, cut in zip(own.multipliers, own.imposed, strict=False)]
-        return replace(
-            own,
-            decision=decision,
-            cost=own.cost * self.cost,
-            lower_bound=own.lower_bound * self.cost,
-            upper_bound=own.upper_bound * self.cost,
-            proven=own.proven * self.cost,
-            violation=own.violation * self._find_row_unit(own.worst_family, row),
-            separations={
-                name: self._convert_separation(name, separation) for name, separation in own.separations.items()
-            },
-            imposed=self.cuts(own.imposed),
-            multipliers=frozen(np.array(multipliers, dtype=float)),
-            added=self.cuts(own.added),
-            dropped=self.cuts(own.dropped),
-        )
-
-    def _convert_evaluations(self, own: EvaluationsFinished) -> EvaluationsFinished:
-        size = own.best_point.size if own.domain is None else own.domain.dimension
-        if own.family:
-            units, value = self._find_index_units(own.family, "reduced", size), 1.0
-        else:
-            units, value = self.tuple_units(size, own.block), self.cost
-        batch = own.batch
-        return replace(
-            own,
-            best_value=own.best_value * value,
-            best_point=frozen(own.best_point * units) if own.best_point.size == size else own.best_point,
-            domain=None
-            if own.domain is None
-            else Box(frozen(own.domain.lower * units), frozen(own.domain.upper * units)),
-            lower_bound=own.lower_bound * self.cost,
-            sketches={role: _convert_sketch(sketch, units) for role, sketch in own.sketches.items()},
-            batch=replace(
-                batch,
-                points=tuple(points * units for points in batch.points),
-                values=tuple(values * value for values in batch.values),
-                best=batch.best * value,
-                origin=None if batch.origin is None else batch.origin * units,
-                stood=batch.stood * value,
-            ),
-        )
-
-    def _convert_trace(self, own: SearchTrace) -> SearchTrace:
-        width = own.points.shape[1]
-        block = max((family.index_set.dimension for family in self._list_searched_families(width)), default=1)
-        return replace(
-            own,
-            value=own.value * self.cost,
-            bound=own.bound * self.cost,
-            points=own.points * self.tuple_units(width, block) if width else own.points,
-        )
+        units = self._find_row_units(name)
+        return bound if units is None else bound * float(units.max() if bound > 0.0 else units.min())
 
     def _list_searched_families(self, width: int) -> Sequence[ConstraintFamily]:
         """The families whose indices a tuple of ``width`` coordinates may be made of: literal ones where they fit."""
@@ -218,65 +214,14 @@ class UsersUnits:
         unit = np.ones(block) if longest is None or longest.index_units is None else longest.index_units
         return np.tile(unit, size // max(block, 1)) if size % max(block, 1) == 0 else np.ones(size)
 
-    def _convert_separation(self, name: str, own: Separation) -> Separation:
-        family = self._find_family(name)
-        rows = None if family is None else family.row_units
-        units = np.ones(own.rows.size) if rows is None else rows[own.rows]
-        return replace(
-            own,
-            indices=own.indices * self._find_index_units(name, own.formulation, own.indices.shape[1]),
-            violations=own.violations * units,
-            bound=own.bound * (1.0 if rows is None else float(rows.max())),
-        )
-
-    def _convert_dual(self, own: Dual, infeasible: bool) -> Dual:
-        return replace(
-            own,
-            bound=own.bound if infeasible else own.bound * self.cost,
-            cuts=self.cuts(own.cuts),
-            mu=own.mu * self.cost / self.equalities if own.mu.size == self.equalities.size else own.mu,
-            z=None if own.z is None else own.z * self.cost / self.image,
-            fixed=own.fixed * self.cost,
-            at=None if own.at is None else own.at * self.decision,
-        )
-
-    def cuts(self, own: Sequence[Cut]) -> tuple[Cut, ...]:
-        """Constraints of the program in its own units, with their multipliers, in the user's."""
-        return tuple(
-            Cut(
-                cut.family,
-                cut.index * self._find_index_units(cut.family, cut.formulation, cut.index.size),
-                cut.row,
-                cut.multiplier * self._compute_price(cut),
-                cut.formulation,
-            )
-            for cut in own
-        )
-
     def _compute_price(self, cut: Cut) -> float:
         """Return the multiplier, in the user's units of cost and row, of a row whose multiplier is 1 in the program's
         own units."""
         return self.cost / self._find_row_unit(cut.family, cut.row)
 
-    def _convert_witness(self, own: WorstConstraint) -> WorstConstraint:
-        units = self._find_index_units(own.constraint, own.formulation, own.index.size)
-        violation = own.violation * self._find_row_unit(own.constraint, own.row)
-        return replace(own, index=own.index * units, violation=violation)
-
-    def _convert_proof(self, own: Proof) -> Proof:
-        def placed(index: Array) -> Array:
-            return index * self._find_index_units(own.family, own.formulation, index.shape[-1])
-
-        return replace(
-            own,
-            bound=self._convert_bound(own.family, own.bound),
-            share=own.bound,
-            violation=own.violation * own.unit,
-            unit=1.0,
-            units=None if (family := self._find_family(own.family)) is None else family.row_units,
-            index=None if own.index is None else placed(own.index),
-            leaves=None if own.leaves is None else (placed(own.leaves[0]), placed(own.leaves[1])),
-        )
+    def _find_row_units(self, name: str) -> Array | None:
+        family = self._find_family(name)
+        return None if family is None else family.row_units
 
     def _find_row_unit(self, name: str, row: int) -> float:
         family = self._find_family(name)
@@ -295,8 +240,3 @@ class UsersUnits:
     def _find_family(self, name: str) -> ConstraintFamily | None:
         """The family of that name; ``None`` for one that only the method knows, which then has no units."""
         return self._families.get(name)
-
-
-def _convert_sketch(sketch: Sketch, units: Array) -> Sketch:
-    lower = frozen(sketch.lower * units)
-    return Sketch(lower, lower if sketch.points else frozen(sketch.upper * units), sketch.rounded)

@@ -139,6 +139,7 @@ def test_sketches_come_back_in_the_users_units():
 
     units = UsersUnits.__new__(UsersUnits)
     units.tuple_units, units.cost = lambda size, block: np.full(size, 4.0), 2.0
+    units.decision = units.image = units.equalities = np.ones(0)
     own = EvaluationsFinished(
         count=1,
         total=1,

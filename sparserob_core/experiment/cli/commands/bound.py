@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from sparserob_core.experiment.cli.shell.options import json_option
+from sparserob_core.experiment.cli.shell.options import json_option, study_out_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.cli.shell.report import report
 from sparserob_core.experiment.terminal.printing import EXIT
@@ -29,13 +29,7 @@ from sparserob_core.experiment.terminal.printing import EXIT
     help="Stop after N seconds: both sides hold as far as they were brought; limits.seconds of CONFIG unless given.",
 )
 @json_option("bound.json")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help=(
-        "A new or empty directory for the config, bound.json and bound.png; runs/NAME-bound/STAMP-HASH unless given."
-    ),
-)
+@study_out_option("bound")
 def bound(
     config: Path, overrides: tuple[str, ...], tolerance: float, seconds: float | None, as_json: bool, out: Path | None
 ) -> int:
@@ -51,12 +45,12 @@ def bound(
     all the same, 130 interrupted.
     """
     from sparserob_core.experiment.bound.bound import bound as find
-    from sparserob_core.experiment.bound.record import list_bound_columns, list_bound_rows, summary_of_bound
+    from sparserob_core.experiment.bound.record import list_bound_columns, list_bound_rows
     from sparserob_core.experiment.cli.shell.live_line import LiveLine
 
     with LiveLine() as line:
         bounds = find(config, overrides, tolerance=tolerance, seconds=seconds, out=out, write=True, notify=line.receive)
     tables = [(bounds.title, list_bound_columns(bounds), list_bound_rows(bounds))]
     remarks = (*bounds.remarks, f"{bounds.status} in {bounds.seconds:.2f} s", f"written to {bounds.directory}")
-    report(as_json, summary_of_bound(bounds), tables, remarks)
+    report(as_json, bounds.summary(), tables, remarks)
     return status_unless_interrupted(EXIT[bounds.status])

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.cli.shell.options import json_option, watching_options
+from sparserob_core.experiment.cli.shell.options import json_option, out_option, watching_options
 from sparserob_core.experiment.cli.shell.report import report
 
 
@@ -98,11 +98,7 @@ def compare(
 @click.option("--seeds", type=int, default=5, show_default=True, help="Searches of each on each landscape.")
 @click.option("--accuracy", type=float, default=1e-3, show_default=True, help="What counts as solved.")
 @click.option("--polish", type=float, default=0.0, show_default=True, help="Share of the budget for a local method.")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help="A new or empty directory for profiles.png, benchmark.json and ioh/, which IOHanalyzer reads.",
-)
+@out_option("A new or empty directory for profiles.png, benchmark.json and ioh/, which IOHanalyzer reads.")
 @json_option("everything as JSON", "the tables")
 def benchmark(
     maximisers: tuple[str, ...],

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.cli.shell.options import json_option
+from sparserob_core.experiment.cli.shell.options import json_option, out_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.cli.shell.report import report
 from sparserob_core.experiment.terminal.printing import EXIT
@@ -44,11 +44,7 @@ from sparserob_core.experiment.terminal.printing import EXIT
     help="Only initial values of at most this size are looked at; needed where the set is unbounded.",
 )
 @json_option("initial_states.json")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help="A new or empty directory for the config, initial_states.json, initial_states.npz and initial_states.png.",
-)
+@out_option("A new or empty directory for the config, initial_states.json, initial_states.npz and initial_states.png.")
 def initial_states(
     config: Path,
     overrides: tuple[str, ...],

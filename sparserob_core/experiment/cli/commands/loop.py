@@ -6,7 +6,13 @@ from pathlib import Path
 
 import click
 
-from sparserob_core.experiment.cli.shell.options import figures_option, json_option, plugins_option, seed_option
+from sparserob_core.experiment.cli.shell.options import (
+    figures_option,
+    json_option,
+    out_option,
+    plugins_option,
+    seed_option,
+)
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.cli.shell.report import report
 from sparserob_core.experiment.terminal.printing import EXIT, printable
@@ -21,11 +27,7 @@ from sparserob_core.experiment.terminal.printing import EXIT, printable
 @click.option("--periods", type=int, default=1, help="Of a plan that repeats: for how many periods; 1 unless given.")
 @seed_option
 @json_option("loop.json")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help="For a CONFIG: the run's directory, new or empty; runs/NAME/STAMP-HASH unless given.",
-)
+@out_option("For a CONFIG: the run's directory, new or empty; runs/NAME/STAMP-HASH unless given.")
 @figures_option
 @plugins_option
 def loop(

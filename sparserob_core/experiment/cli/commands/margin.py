@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from sparserob_core.experiment.cli.shell.options import json_option, watching_options
+from sparserob_core.experiment.cli.shell.options import json_option, study_out_option, watching_options
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.cli.shell.report import Table, report
 
@@ -36,13 +36,7 @@ EXIT = {"certified": 0, "unbounded": 0, "infeasible": 3, "undecided": 4}
     "--curve", type=int, default=20, show_default=True, help="Points of the curve of cost against the factor; 0: none."
 )
 @json_option("margin.json")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help=(
-        "A new or empty directory for the config, margin.json and margin.png; runs/NAME-margin/STAMP-HASH unless given."
-    ),
-)
+@study_out_option("margin")
 @watching_options("the search")
 def margin(
     config: Path,
@@ -74,7 +68,7 @@ def margin(
     is feasible at any factor, 4 a side could not be proven, 130 interrupted.
     """
     from sparserob_core.experiment.cli.shell.live_line import LiveLine
-    from sparserob_core.experiment.margin.margin import curve_rows, margin_rows, summary_of_margin
+    from sparserob_core.experiment.margin.margin import curve_rows, margin_rows
     from sparserob_core.experiment.margin.margin import margin as find
     from sparserob_core.experiment.run.viewer import recorded, recorder
 
@@ -94,7 +88,7 @@ def margin(
         tables.append(("Cost against the horizon", columns, curve_rows(answer)))
     recordings = (recording for observer in observers for recording in recorded(observer, save))
     remarks = (*answer.remarks, f"written to {answer.directory}", *recordings)
-    report(as_json, summary_of_margin(answer), tables, remarks)
+    report(as_json, answer.summary(), tables, remarks)
     if serve and answer.status != "undecided":  # the Ctrl-C that ends a page has cut nothing short
         return EXIT[answer.status]
     return status_unless_interrupted(EXIT[answer.status])

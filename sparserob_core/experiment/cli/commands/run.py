@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from sparserob_core.experiment.cli.shell.options import figures_option, json_option
+from sparserob_core.experiment.cli.shell.options import figures_option, json_option, out_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.cli.shell.report import report
 from sparserob_core.experiment.terminal.printing import EXIT
@@ -15,11 +15,7 @@ from sparserob_core.experiment.terminal.printing import EXIT
 @click.command()
 @click.argument("config", type=click.Path(path_type=Path))
 @click.argument("overrides", nargs=-1, metavar="[KEY=VALUE]...")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help="The run's directory, new or empty; runs/NAME/STAMP-HASH unless given.",
-)
+@out_option("The run's directory, new or empty; runs/NAME/STAMP-HASH unless given.")
 @click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 @json_option("result.json")
 @figures_option

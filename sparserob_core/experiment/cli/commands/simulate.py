@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from sparserob_core.experiment.cli.shell.options import json_option, plugins_option, seed_option
+from sparserob_core.experiment.cli.shell.options import json_option, out_option, plugins_option, seed_option
 from sparserob_core.experiment.cli.shell.report import report
 
 
@@ -25,11 +25,7 @@ from sparserob_core.experiment.cli.shell.report import report
 )
 @seed_option
 @json_option("simulation-LAW.json")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help="Draw the trajectories into this file, which ends in .png, .pdf or .svg.",
-)
+@out_option("Draw the trajectories into this file, which ends in .png, .pdf or .svg.")
 @plugins_option
 def simulate(
     directory: Path,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.cli.shell.options import watching_options
+from sparserob_core.experiment.cli.shell.options import out_option, watching_options
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.cli.shell.report import report
 
@@ -37,10 +37,8 @@ if TYPE_CHECKING:
     metavar="NAME",
     help="Where the runs are made: a name, or '{name: processes, workers: 2}'; the config's own unless given.",
 )
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help="A new directory, or that of a study of the same base to go on with; runs/NAME-sweep/STAMP-HASH unless given.",
+@out_option(
+    "A new directory, or that of a study of the same base to go on with; runs/NAME-sweep/STAMP-HASH unless given."
 )
 @click.option("--resume", type=click.Path(path_type=Path), metavar="DIR", help="Go on with the study in DIR.")
 @click.option("--figures/--no-figures", default=False, help="Whether to draw every run too.", show_default=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from sparserob_core.experiment.cli.shell.options import figures_option
+from sparserob_core.experiment.cli.shell.options import figures_option, out_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.cli.shell.report import report
 from sparserob_core.experiment.terminal.printing import EXIT
@@ -22,11 +22,7 @@ from sparserob_core.experiment.terminal.printing import EXIT
 )
 @click.option("--serve", is_flag=True, help="Show it in a browser of this machine, until Ctrl-C.")
 @click.option("--connect", metavar="ADDRESS", help="Send it to a viewer that listens there, such as 127.0.0.1:9876.")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help="The run's directory, new or empty; runs/NAME/STAMP-HASH unless given.",
-)
+@out_option("The run's directory, new or empty; runs/NAME/STAMP-HASH unless given.")
 @figures_option
 def watch(
     config: Path,

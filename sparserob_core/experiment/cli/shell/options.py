@@ -45,3 +45,14 @@ plugins_option = click.option(
 def json_option(what: str, table: str = "the table") -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """``--json``: print ``what`` instead of the table."""
     return click.option("--json", "as_json", is_flag=True, help=f"Print {what} instead of {table}.")
+
+
+def out_option(meaning: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """``--out``: the path of a file or a directory that is written."""
+    return click.option("--out", type=click.Path(path_type=Path), help=meaning)
+
+
+def study_out_option(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """``--out``: the directory of the study ``name``."""
+    files = f"{name}.json and {name}.png"
+    return out_option(f"A new or empty directory for the config, {files}; runs/NAME-{name}/STAMP-HASH unless given.")

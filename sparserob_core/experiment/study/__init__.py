@@ -1,0 +1,1 @@
+"""The kit of every study: its directory, its files, its figure."""
