@@ -80,7 +80,8 @@ class Case:
             problem, dictionary = on_one_grid(self.problem, self.disturbance)
             object.__setattr__(self, "problem", problem)
             object.__setattr__(self, "disturbance", dictionary)
-        times = np.union1d(self.control.breakpoints, self.control.breakpoints + self.problem.system.delay)
+        ends = self.control.breakpoints
+        times = np.unique([*ends, *(ends + self.problem.system.delay), *(ends[1:-1] + self.problem.jitter)])
         breakpoints = join_breakpoints(self.disturbance.breakpoints, times)
         object.__setattr__(self, "disturbance", self.disturbance.on(breakpoints))
         if self.policy is not None and self.control.functions == self.control.pieces:
@@ -242,7 +243,7 @@ class Case:
         early_inputs = (
             [stacked([[v] for v in balls([*before(self.problem)])])] if self.problem.system.delay > 0.0 else []
         )
-        inputs = [*early_inputs, *self.pieces]
+        inputs = [*early_inputs, *self.sources.means]
         if self.problem.system.drifts:
             inputs = [stacked([[v] for v in (*u.entries(), *balls([1.0]))]) for u in self.clock.each(inputs)]
         return Scene(
