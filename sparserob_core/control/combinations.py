@@ -32,6 +32,7 @@ FEATURES = (
     "execution",
     "two classes",
     "pieces of their own",
+    "jitter",
 )
 """The features of the table "Every pair" in docs/scope.md, in its order."""
 
@@ -74,7 +75,7 @@ REFUSALS: dict[str, dict[str, Refusal]] = {
     },
     "execution": {
         "fixed final state": Refusal(
-            "none beside fixed final values, which an error of execution misses: a terminal set such as box",
+            "none beside fixed final values, which a deviation of the control misses: a terminal set such as box",
             "execution",
             ("fixed final state",),
         ),
@@ -88,6 +89,40 @@ REFUSALS: dict[str, dict[str, Refusal]] = {
         "affine": Refusal(
             "none under feedback, where the size of the control, and with it that of its error, answers too",
             "execution",
+            ("affine",),
+        ),
+    },
+    "jitter": {
+        "execution": Refusal(
+            "none beside execution: the errors as a disturbance through the columns of B", "jitter", ("execution",)
+        ),
+        "delay": Refusal(
+            "none beside system.delay: late changes as a disturbance through the columns of B", "jitter", ("delay",)
+        ),
+        "repeat": Refusal(
+            "none beside repeat, whose seam is a change too: one period that ends in the initial set", "jitter"
+        ),
+        "mixed": Refusal("none beside mixed: bounds of the state and of the control apart", "jitter", ("mixed",)),
+        "integral": Refusal(
+            "none beside integrals with G, which would count what is delivered: an integral of H",
+            "jitter",
+            ("integral",),
+        ),
+        "fixed final state": Refusal(
+            "none beside fixed final values, which a deviation of the control misses: a terminal set such as box",
+            "jitter",
+            ("fixed final state",),
+        ),
+        "parameters in no box": Refusal("none beside parameters in another set than a box", "jitter"),
+        "measurable in a curved set": Refusal(
+            "none beside measurable disturbances in a curved set where the system has pieces or parameters", "jitter"
+        ),
+        "curved path and general parameters": Refusal(
+            "none beside curved sets of states with parameters that the state does not depend on affinely", "jitter"
+        ),
+        "affine": Refusal(
+            "0 under feedback: a disturbance through the columns of B, as large as the steps of the control",
+            "jitter",
             ("affine",),
         ),
     },

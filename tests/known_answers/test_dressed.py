@@ -73,6 +73,7 @@ LINES: dict[str, Config] = {
     "quadratic": {"cost": QUADRATIC},
     "group": {"system": BOTH, "control": {"box": [1, 1]}, "cost": {"group": [[1, 2]]}},
     "execution": {"execution": [0.03]},
+    "jitter": {"jitter": 0.05},
     "pieces": {"system": {"pieces": [{"until": 1.0, **SYSTEM}, {"until": 2.0, **OTHER}]}},
     "curved path": {"path": [ROUND]},
     "curved control": {"system": BOTH, "control": {"norm": {"p": 2, "radius": 1.0}}},

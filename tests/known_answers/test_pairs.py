@@ -134,6 +134,7 @@ FEATURES: dict[str, Callable[[Config], object]] = {
     "execution": in_problem(execution=0.03),
     "two classes": of_two_classes,
     "pieces of their own": on_own_pieces,
+    "jitter": in_problem(jitter=0.05),
 }
 NAMES = list(FEATURES)
 REFUSED = {frozenset((feature, companion)) for feature, companion, _ in refused_pairs()}

@@ -163,7 +163,8 @@ class Source:
 
 @dataclass
 class Rows:
-    """``constant + on_u u + on_size |u| + sources <= bound``, ``(R, ...)``: of blocks the effects ``(R, q)`` on the
+    """``constant + on_u u + on_size s + sources <= bound``, ``(R, ...)``, with ``s`` the absolute values of the control
+    and of its changes: of blocks the effects ``(R, q)`` on the
     coordinates of each, of other sources the most that they add (``added``)."""
 
     on_u: Array
@@ -202,6 +203,7 @@ class Plan:
         problem, T = self.problem, self.problem.horizon
         delay, own = problem.system.delay, problem.disturbance_breakpoints or ()
         ends = [0.0, T, *self.breakpoints, *(self.breakpoints + delay), *self.of_disturbance]
+        ends += (self.breakpoints + problem.jitter).tolist()
         ends += [phase.begin for phase in problem.system.phases]
         for one in (*problem.windows, *problem.integral):
             ends += [one.start, float(one.stop or 0.0)]
@@ -233,6 +235,13 @@ class Plan:
     def acting(self) -> Array:
         """Of every step the piece of the control that acts, later by the delay."""
         return self.piece(self.breakpoints + self.problem.system.delay, self.middles)
+
+    @cached_property
+    def late(self) -> Array:
+        """Of every step whether a change of the control may come after it."""
+        changes = self.breakpoints[1:-1]
+        before = np.searchsorted(changes, self.middles, side="right") - 1
+        return (before >= 0) & (self.middles < changes[np.maximum(before, 0)] + self.problem.jitter)
 
     @cached_property
     def commanded(self) -> Array:
@@ -345,6 +354,7 @@ class Flow:
         start = np.concatenate([np.asarray(problem.initial_state, dtype=float), np.zeros(len(plan.integrals))])
         constant, added = back @ start + effect[:, :, -1].sum(axis=1), np.zeros(R)
         on_u, on_size = np.zeros((R, m, K + 1)), np.zeros((R, m, K + 1))  # the last one: before the delay is over
+        on_change = np.zeros((R, m, K - 1))
         for i in range(m):
             np.add.at(on_u[:, i].T, plan.acting[:j], effect[:, :, i].T)
             if problem.execution is not None:
@@ -353,6 +363,12 @@ class Flow:
                 if plan.above:
                     most = np.maximum(most, np.abs(ends[..., i]).mean(axis=2))
                 np.add.at(on_size[:, i].T, plan.acting[:j], share * most.T)
+            if problem.jitter:  # half of the old and half of the new value, and up to half of the change beside it
+                late = np.flatnonzero(plan.late[:j])
+                half = effect[:, late, i].T / 2
+                np.add.at(on_u[:, i].T, plan.acting[late], -half)
+                np.add.at(on_u[:, i].T, plan.acting[late] - 1, half)
+                np.add.at(on_change[:, i].T, plan.acting[late] - 1, np.abs(half))
             np.add.at(on_u[:, i].T, plan.commanded[:j], effect[:, :, m + i].T)
         before = np.zeros(m) if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
         constant = constant + on_u[:, :, -1] @ before + on_size[:, :, -1] @ np.abs(before)
@@ -369,7 +385,8 @@ class Flow:
             np.add.at(sums, one.pieces[:j], pushed.transpose(1, 0, 2))
             blocks += list(sums)
         blocks += [] if problem.initial_set is None else [back[:, : problem.system.states]]
-        flat = (on_u[:, :, :K].reshape(R, -1), on_size[:, :, :K].reshape(R, -1))
+        sizes = on_size[:, :, :K].reshape(R, -1), on_change.reshape(R, -1)
+        flat = (on_u[:, :, :K].reshape(R, -1), np.hstack(sizes))
         return Rows(*flat, constant, added, blocks, bound, size)
 
 
@@ -417,9 +434,9 @@ def of_window(flow: Flow, window: Any) -> Iterator[Rows]:
 
 def _none(plan: Plan) -> Rows:
     """No row at all."""
-    n = plan.m * plan.K
     blocks = [np.zeros((0, bound.dimension)) for bound, _ in plan.blocks]
-    return Rows(np.zeros((0, n)), np.zeros((0, n)), np.zeros(0), np.zeros(0), blocks, np.zeros(0), np.zeros(0))
+    shapes = (0, plan.m * plan.K), (0, plan.m * (2 * plan.K - 1))
+    return Rows(np.zeros(shapes[0]), np.zeros(shapes[1]), np.zeros(0), np.zeros(0), blocks, np.zeros(0), np.zeros(0))
 
 
 def of_control(plan: Plan) -> Rows:
@@ -441,7 +458,8 @@ def of_control(plan: Plan) -> Rows:
             parts += [(row @ step, limit + row @ off, np.abs(h).max()) for row, limit in zip(H, h, strict=True)]
     on_u, bound, size = (np.array(part) for part in zip(*parts, strict=True))
     blocks = [np.zeros((len(bound), one.dimension)) for one, _ in plan.blocks]
-    return Rows(on_u, np.zeros_like(on_u), np.zeros(len(bound)), np.zeros(len(bound)), blocks, bound, size)
+    none, sizes = np.zeros(len(bound)), np.zeros((len(bound), m * (2 * K - 1)))
+    return Rows(on_u, sizes, none, none, blocks, bound, size)
 
 
 @dataclass(frozen=True)
@@ -515,7 +533,7 @@ class Program:
         self.groups = [*grouped, *alone]
         sizes = {
             "theta": self.U.shape[1],
-            "size": m * K,
+            "size": m * (2 * K - 1),
             "norm": len(self.groups) * K,
             "curve": 1,
             "acts": len(self.groups) * K if self.counts else 0,
@@ -539,14 +557,19 @@ class Program:
         """Sizes are no less than absolute values, and norms than the size of each channel; pieces that act."""
         plan, K = self.plan, self.plan.K
         largest = np.maximum(*(support(plan.problem.control, s * np.eye(plan.m)) for s in (1.0, -1.0)))
+        own_size = np.eye(plan.m * (2 * K - 1))
+        for number, (i, k) in enumerate(np.ndindex(plan.m, K - 1)):
+            for sign in (1.0, -1.0):
+                change = self.U[i * K + k + 1] - self.U[i * K + k]
+                self._add(0.0, theta=sign * change, size=-own_size[plan.m * K + number])
         for i in range(plan.m * K):
             for sign in (1.0, -1.0):
-                self._add(0.0, theta=sign * self.U[i], size=-np.eye(plan.m * K)[i])
+                self._add(0.0, theta=sign * self.U[i], size=-own_size[i])
             g = next(number for number, group in enumerate(self.groups) if i // K in group)
             own = np.eye(len(self.groups) * K)[g * K + i % K]
-            self._add(0.0, size=np.eye(plan.m * K)[i], norm=-own)
+            self._add(0.0, size=own_size[i], norm=-own)
             if self.counts:
-                self._add(0.0, size=np.eye(plan.m * K)[i], acts=-largest[i // K] * own)
+                self._add(0.0, size=own_size[i], acts=-largest[i // K] * own)
         self.equal, self.values = list[Array](), list[float]()
         for row, value in self.fixed:
             self.equal.append(self._row(theta=row @ self.U))
@@ -693,7 +716,7 @@ class Program:
                     answers = np.zeros(len(self.answers))
                     for place, (number, channel, k, q) in enumerate(self.answers):
                         answers[place] = sign * points[number][q] * (channel * self.plan.K + k == i)
-                    self._add(0.0, theta=sign * self.U[i], size=-np.eye(u.size)[i], answers=answers)
+                    self._add(0.0, theta=sign * self.U[i], size=-np.eye(size.size)[i], answers=answers)
                     needed = True
         return needed
 

@@ -434,7 +434,8 @@ def _bound_by_tree(case: Case) -> float:
                 raise Broken("tree: expected the number of a constraint and its multiplier")
             entry = entries[pair[0]]
             constraints.append({**entry, "multiplier": pair[1]} if isinstance(entry, Mapping) else entry)
-        return weighted(case, {"constraints": constraints, "equalities": leaf.get("equalities")})[0]
+        others = {name: leaf.get(name) for name in ("equalities", "late")}
+        return weighted(case, {"constraints": constraints, **others})[0]
 
     return activity.bound_by_tree(case, listed(data, "nodes"), of_leaf)
 

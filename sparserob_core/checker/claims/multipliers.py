@@ -45,7 +45,7 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
         raise Unchecked("the certificate holds no multipliers, which this method does not offer")
     if not isinstance(data, Mapping):
         raise Broken("multipliers: expected those of constraints, equalities and pieces")
-    entries = listed(data, "constraints")
+    entries, m = listed(data, "constraints"), case.problem.system.controls
     if len(entries) > MAX_MULTIPLIERS:
         raise Broken(f"{len(entries)} multipliers are too many to be checked")
     rows = [weighted_row for entry in entries for weighted_row in rows_of(case, entry)]
@@ -59,9 +59,11 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
         )
         # a disturbance of one point counts; where none may reach the state, any member of its set may stand for it
         rows.append((multiplier, replace(row, constant=row.constant + compute_middle_effect(case, state))))
+    if case.problem.jitter and data.get("late") is not None:  # any are valid, 0 too
+        rows.append((1.0, case.duality.bound_changes(rows, shaped(data, "late", (m, case.control.pieces - 1)))))
     if case.control.functions >= case.control.pieces:  # every piece has a function of its own
         return rows, None
-    return rows, shaped(data, "pieces", (case.problem.system.controls, case.control.pieces))
+    return rows, shaped(data, "pieces", (m, case.control.pieces))
 
 
 def touched_by(case: Case, data: object) -> Sequence[arb_mat] | None:
@@ -166,7 +168,8 @@ def _derive_base_row(
     if measurable_input is not None:
         row = replace(row, constant=row.constant + ball(measurable_input.added(c, time)[0]))
     sizes, early_bound = case.sources.erring(c, time, parameter.tolist())
-    row = replace(row, constant=row.constant + early_bound, sizes=sizes)
+    late = None if sizes is None or not case.problem.jitter else sizes[1::2]
+    row = replace(row, constant=row.constant + early_bound, sizes=sizes if late is None else None, late=late)
     if window is not None and window.is_mixed:
         piece = piece_of(case, window, entry, time)
         row.slope[piece] = [a + b for a, b in zip(row.slope[piece], balls(gain), strict=True)]

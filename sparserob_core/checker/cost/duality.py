@@ -40,6 +40,8 @@ class ConstraintRow:
     """The inequality ``constant + sum_k slope_k u_k + sizes_k |u_k| <= charged`` of every feasible control.
 
     ``slope`` is a list of ``m`` balls per piece of the control; ``sizes (K, m)`` are nonnegative numbers, or ``None``.
+    Where changes of the control may come late, ``late (K - 1, m)`` are the numbers of ``|u_{k+1} - u_k| / 2``, which
+    are added likewise; `bound_changes` replaces them by a row without them.
 
     A control with feedback is ``u_k = v_k + sum_j M_kj e_j``, with the innovations ``e_j`` of its ``deviations``.
     A certificate names these, block by block; the nominal control has none. A control without feedback has none either,
@@ -52,6 +54,7 @@ class ConstraintRow:
     sizes: Array | None = None
     deviations: Sequence[Sequence[arb]] = ()
     charged: tuple[int, int] | str | None = None
+    late: Array | None = None
 
 
 @final
@@ -113,7 +116,8 @@ class Duality:
         m, problem = self.problem.system.controls, self.problem
         delay = problem.system.delay
         piece_starts = [float(s) + delay for s in self.control.breakpoints[:-1]]  # times at which a piece begins to act
-        starts = sorted({0.0, *(s for s in piece_starts if s < time)})
+        settled = [piece_starts[0], *(s + problem.jitter for s in piece_starts[1:])]  # and is no longer late
+        starts = sorted({0.0, *(s for s in (*piece_starts, *settled) if s < time)})
         weights = self.flows.weigh(direction, parameter, [*starts, time])
         initial_slope, initial_state = weights.free.entries(), np.asarray(problem.initial_state)
         constant = sum((w * ball(x) for w, x in zip(initial_slope, initial_state, strict=True)), ball(0.0)) - limit
@@ -123,7 +127,9 @@ class Duality:
             if k < 0:
                 constant = sum((w * ball(u) for w, u in zip(coefficients[:m], before(problem), strict=True)), constant)
             else:
-                slope[k] = [a + b for a, b in zip(slope[k], coefficients[:m], strict=True)]
+                acting = [k] if start >= settled[k] else [k - 1, k]  # half of the old and half of the new value
+                for j in acting:
+                    slope[j] = [a + b / len(acting) for a, b in zip(slope[j], coefficients[:m], strict=True)]
             constant = sum(coefficients[m:], constant)  # a drift, whose input is 1
         if disturbed and problem.initial_set is not None:
             constant = constant + known(problem.initial_set).support(initial_slope)
@@ -251,6 +257,20 @@ class Duality:
                     [c + ball(y) * ball(v) for c, v in zip(total, size_row, strict=True)] for total, size_row in pairs
                 ]
         return totals
+
+    def bound_changes(self, rows: Sequence[tuple[float, ConstraintRow]], offered: Array) -> ConstraintRow:
+        """Return a row that is never more than what changes that come late add to ``rows`` with their multipliers: the
+        linear function ``v (u_{k+1} - u_k) / 2`` of every change, with ``v`` as ``offered (m, K - 1)`` as far as its
+        size is at most the sum of `ConstraintRow.late`."""
+        m, K = self.problem.system.controls, self.control.pieces
+        slope = [[ball(0.0)] * m for _ in range(K)]
+        for k in range(K - 1):
+            for c in range(m):
+                pairs = [(y, row.late[k, c]) for y, row in rows if row.late is not None]
+                most = max(float(sum((ball(y) * ball(size) for y, size in pairs), ball(0.0)).lower()), 0.0)
+                half = ball(min(max(float(offered[c, k]), -most), most)) / 2
+                slope[k][c], slope[k + 1][c] = slope[k][c] - half, slope[k + 1][c] + half
+        return ConstraintRow(ball(0.0), slope)
 
     def _substitute_slopes(
         self, slopes: list[list[arb]], pieces: Sequence[Sequence[float]]

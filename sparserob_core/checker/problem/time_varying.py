@@ -20,7 +20,7 @@ def make_time_varying(problem: OptimalControlProblem) -> OptimalControlProblem:
     parameters.
     """
     system = problem.system
-    is_execution_case = problem.execution is not None and bool(system.switches or system.parameter_count)
+    is_execution_case = problem.delivery is not None and bool(system.switches or system.parameter_count)
     is_measurable_case = problem.measurable is not None and isinstance(system.parameters, Box)
     if system.varies or not (is_execution_case or is_measurable_case):
         return problem

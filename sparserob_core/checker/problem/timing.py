@@ -33,8 +33,9 @@ class Timing:
 
     @cached_property
     def acting(self) -> list[float]:
-        """The times at which the pieces of the control begin to act, from 0 on."""
-        starts: list[float] = np.unique([0.0, *(self.control[:-1] + self.problem.system.delay)]).tolist()
+        """The times at which the pieces of the control begin to act, from 0 on, and until which they may be late."""
+        settled = self.control[1:-1] + self.problem.jitter if self.problem.jitter else np.zeros(0)
+        starts: list[float] = np.unique([0.0, *(self.control[:-1] + self.problem.system.delay), *settled]).tolist()
         return starts
 
     @property

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import final
 
 import numpy as np
@@ -63,12 +64,44 @@ class Sources:
         return None if self.measurable_input is None else self.measurable_input.at(parameter)
 
     @cached_property
+    def means(self) -> list[arb_mat]:
+        """The middle of what may be delivered, from each of the times `Timing.acting` on.
+
+        It is the value of a piece, and half of the old and half of the new value while a change may be late.
+        """
+        return self._between_changes(lambda old, new: new if old is new else (old + new) / 2, lambda value: value)
+
+    def _between_changes(
+        self, late: Callable[[arb_mat, arb_mat], arb_mat], settled: Callable[[arb_mat], arb_mat]
+    ) -> list[arb_mat]:
+        """Return one matrix for each interval in which a change may be late, and for each in which none is."""
+        pieces = self.pieces()
+        if not self.problem.jitter:
+            return [settled(value) for value in pieces]
+        after = [matrix for old, new in pairwise(pieces) for matrix in (late(old, new), settled(new))]
+        return [*map(settled, pieces[:1]), *after]
+
+    @cached_property
+    def changes(self) -> BoundedInput | None:
+        """What changes of the control that come late may deliver beside `means`: up to half of the change."""
+        if not self.problem.jitter:
+            return None
+        if self.timing.answering:
+            raise Unchecked("the checker knows changes that come late without feedback")
+        m, breakpoints = self.problem.system.controls, np.array([*self.timing.acting, self.problem.horizon])
+        none = stacked([[v] for v in balls(np.zeros(m))])
+        pieces = self._between_changes(lambda old, new: (new - old) / 2, lambda _: none)
+        return self._build_bounded_input(SizedInput(np.ones(m), breakpoints, pieces, channels(m)))
+
+    @cached_property
     def execution(self) -> BoundedInput | None:
-        """The errors of execution; ``None`` where the command is delivered exactly. They have no pieces where the
-        certificate has no control."""
+        """The errors of execution, or `changes` that come late; ``None`` where the command is delivered exactly.
+
+        They have no pieces where the certificate has no control.
+        """
         shares, system = self.problem.execution, self.problem.system
         if shares is None:
-            return None
+            return self.changes
         if self.timing.answering:
             raise Unchecked("the checker knows errors of execution without feedback")
         shares, breakpoints, pieces = np.asarray(shares, dtype=float), self.timing.control, self.pieces()
@@ -96,8 +129,8 @@ class Sources:
 
     def erring(self, c: Array, time: float, parameter: Sequence[float]) -> tuple[Array | None, arb]:
         """Return lower bounds of what errors of execution add to ``c'x(t)`` at a parameter, for a command of size 1 on
-        every piece, ``(K, m)`` or ``None``. The second value is that for the control that acts until the delay is over,
-        or 0."""
+        every piece, ``(K, m)`` or ``None``; where changes may come late, for changes of size 2 on ``2 K - 1`` ones.
+        The second value is that for the control that acts until the delay is over, or 0."""
         delivered = self.delivered_at(parameter)
         bounds, none = None if delivered is None else delivered.least(c, time), ball(0)
         if bounds is None or not self.problem.system.delay > 0.0:

@@ -66,7 +66,7 @@ class ProvenPlan:
             return None
         if problem.names.corners:  # parameters beside the time are states by now, that nobody measures
             return None
-        if problem.classes - {"piecewise_constant"} or problem.execution is not None:  # any function of time
+        if problem.classes - {"piecewise_constant"} or problem.delivery is not None:  # any function of time
             return None
         steps, grid = response.steps(KNOWN), response.grid
         inputs, disturbance_responses, nominal = np.append(control, np.ones(grid.constants)), list[Array](), state

@@ -14,6 +14,7 @@ from sparserob_core.brief import noun
 from sparserob_core.control.combinations import refusal, refuse_cases
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import WEIGHTS, Cost, checked_weights, counted, integrals
+from sparserob_core.control.problem.delivery import Delivery
 from sparserob_core.control.problem.disturbances import (
     Breakpoints,
     Classes,
@@ -132,6 +133,9 @@ class OptimalControlProblem(Term):
         True where the plan begins again at the horizon, for ever; see Notes.
     execution : array (m,), optional
         The relative error of execution of each control, from 0 to 1; see Notes. No errors unless given.
+    jitter : float, default 0
+        The time by which every change of the control may come late, less than every interval of the control's
+        dictionary; see Notes.
     commanded : tuple of int, optional
         The states that are integrals of the commanded control, which no error of execution reaches. They occur in
         larger problems that are made of integrals; users do not give them.
@@ -161,6 +165,11 @@ class OptimalControlProblem(Term):
     The difference may be any function of time, and is 0 where the command is 0. Every constraint on the state holds
     nonetheless. The set of the control, the set of its steps, the cost, and the control in mixed constraints and
     integrals refer to the command.
+
+    Jitter. From a change of the control until ``jitter`` later, each delivered control may be any function of time with
+    values between the old and the new value. So every change may come late by another time, may take several steps, or
+    may be gradual. The first value acts from the beginning. Every constraint on the state holds nonetheless. The set of
+    the control, the set of its steps and the cost refer to the plan, and quadratic terms to its trajectory.
 
     Fields after construction. ``weights`` is ``(m,)``, or ``(r, 1 + m)`` where rows are given. ``path``, ``terminal``
     and ``integral`` are tuples, every window has its ``stop``, and constraints that restrict nothing are gone. For a
@@ -207,6 +216,7 @@ class OptimalControlProblem(Term):
     measurements: Measurements | None = field(default=None, metadata=TERMS)
     repeat: bool | Repeating = field(default=False, metadata=UNITLESS)
     execution: npt.ArrayLike | None = field(default=None, metadata=UNITLESS)
+    jitter: float = field(default=0.0, metadata=measured(lambda of: of.time))
     commanded: tuple[int, ...] = field(default=(), metadata=UNITLESS)
     disturbance_breakpoints: Breakpoints | None = field(
         default=None, metadata=measured(lambda of: of.time, _shift_breakpoints)
@@ -251,6 +261,7 @@ class OptimalControlProblem(Term):
             self._require_return()
         self._check_uncertain()
         self._set_field("execution", self._check_execution())
+        self._set_field("jitter", self._check_jitter())
         sealed(self)
 
     @property
@@ -367,9 +378,14 @@ class OptimalControlProblem(Term):
             )
         if not shares.any():
             return None
+        refuse_cases("execution", self._list_deviation_cases(), got=f"{shares.tolist()}")
+        return shares
+
+    def _list_deviation_cases(self) -> dict[str, bool]:
+        """Return the combinations with deviations of the delivered control of which nothing can be proven yet."""
         sets = [entry if isinstance(entry, ConvexSet) else entry.set for entry in (*self.path, *self.terminal_sets)]
         timed = self._find_timed_system()
-        cases = {
+        return {
             "fixed final state": bool(self.terminal_equalities),
             "parameters in no box": timed is None,
             "measurable in a curved set": any(bound.halfspaces() is None for bound in filter(None, [self.measurable]))
@@ -378,8 +394,31 @@ class OptimalControlProblem(Term):
             and timed.powers is not None
             and any(bound.halfspaces() is None for bound in sets),
         }
-        refuse_cases("execution", cases, got=f"{shares.tolist()}")
-        return shares
+
+    def _check_jitter(self) -> float:
+        """Return the jitter; raise `InputError` where it is no time within the horizon, or for combinations with other
+        fields of which nothing can be proven."""
+        jitter = as_bound("jitter", self.jitter)
+        if jitter.shape != (1,) or not (jitter[0] == 0.0 or SAME_TIME * self.horizon < jitter[0] < self.horizon):
+            expected = f"0, or a time below {self.horizon:g} (the horizon) and above rounding"
+            raise InputError(path="jitter", expected=expected, got=f"{self.jitter!r}")
+        if jitter[0] > 0.0:
+            cases = {
+                "execution": self.execution is not None,
+                "delay": self.system.delay > 0.0,
+                "repeat": bool(self.repeat),
+                "mixed": any(isinstance(entry, MixedConstraint) for entry in self.windows),
+                "integral": any(np.any(entry.G) for entry in self.integral),
+            }
+            refuse_cases("jitter", {**cases, **self._list_deviation_cases()}, got=f"{jitter[0]:g}")
+        return float(jitter[0])
+
+    @property
+    def delivery(self) -> Delivery | None:
+        """How the delivered control may differ from the command; ``None`` where it does not."""
+        if self.jitter:
+            return Delivery(np.ones(self.system.controls), self.jitter)
+        return None if self.execution is None else Delivery(np.asarray(self.execution))
 
     def _find_timed_system(self) -> System | None:
         """Return the system as one whose entries depend on the time; ``None`` where its parameters are in no box."""

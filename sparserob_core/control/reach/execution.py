@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Self, final
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import block_norms
@@ -36,7 +37,8 @@ STEP = 1e-6  # of the horizon, over which a slope is a difference: a tenth of it
 class Execution(ABC):
     """Errors of execution: the delivered control may differ from the commanded one by ``shares (m,)`` of it.
 
-    ``breakpoints (K + 1,)`` are those of the command, on which commands may act with a delay. ``error_mask (d,)`` is 0
+    ``breakpoints (K + 1,)`` are those of the command, on which commands may act with a delay. ``scaling (K, K)`` maps a
+    command to the values on its pieces of which the shares are taken. ``error_mask (d,)`` is 0
     for states that add up what is commanded, and do nothing else, and 1 for others.
     """
 
@@ -44,6 +46,7 @@ class Execution(ABC):
     breakpoints: Array
     shares: Array
     error_mask: Array
+    scaling: csr_array
 
     def over(self, control: Array, rows: Array, leg: Leg, joined: Combination | None = None) -> Support:
         """Return the support of the worst errors of a control on functionals over cells of time.
@@ -143,8 +146,17 @@ class Execution(ABC):
 
     def acts(self, control: Array) -> Array:
         """Return the absolute value of all that acts, ``(m, late + K)``, for a command ``(m, K)``."""
-        size, before = np.abs(control), self.response.grid.before
+        size, before = self.sizes(control), self.response.grid.before
         return size if before is None or not self.late else np.column_stack([np.abs(before), size])
+
+    def sizes(self, control: Array) -> Array:
+        """Return the absolute values ``(m, K)`` of which the shares of a command ``(m, K)`` are taken."""
+        return np.asarray(np.abs(control @ self.scaling))
+
+    def deviations(self, control: Array) -> Array:
+        """Return the largest errors ``(m, L)`` of a command ``(m, K)`` on the pieces of the grid."""
+        acting = self.response.grid.control_piece + self.late
+        return np.asarray(self.shares[:, None] * self.acts(control)[:, acting])
 
     @property
     def size(self) -> int:

@@ -103,7 +103,7 @@ class WorstFunctionals:
         """The decision of which a control's coefficients are ``theta``."""
         if self.execution is None:
             return theta.ravel()
-        return np.concatenate([theta.ravel(), np.abs(self.dictionary.control(theta.ravel())).ravel()])
+        return np.concatenate([theta.ravel(), self.execution.sizes(self.dictionary.control(theta.ravel())).ravel()])
 
     @cached_property
     def known(self) -> Array:
@@ -261,18 +261,19 @@ class WorstFunctionals:
             result[chunk] = weights.free @ self.response.initial_state + control_effect + support
             if roughly:
                 result[chunk] += np.einsum(
-                    "klm,ml->k", np.abs(weights.control[..., : self.channels]), self.bound_execution_errors(control)
+                    "klm,ml->k", np.abs(weights.control[..., : self.channels]), self.bound_execution_errors(theta)
                 )
             elif self.execution is not None:
                 error_directions = self.execution.extend_directions(directions[chunk], parameters[chunk])
                 result[chunk] += self.execution.added(self.control(theta), times[chunk], error_directions)
         return result
 
-    def bound_execution_errors(self, control: Array) -> Array:
-        """Return the largest error of execution of every channel of a control on the pieces of the merged grid,
+    def bound_execution_errors(self, theta: Array) -> Array:
+        """Return the largest error of execution of every channel at a decision, on the pieces of the merged grid,
         ``(m, L)``."""
-        commanded = np.abs(control[: self.channels])
-        return 0.0 * commanded if self.execution is None else self.execution.shares[:, None] * commanded
+        if self.execution is None:
+            return np.zeros((self.channels, self.response.grid.pieces))
+        return self.execution.deviations(self.control(theta))
 
     @shaped
     def offsets(

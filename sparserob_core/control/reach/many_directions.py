@@ -41,7 +41,7 @@ class ManyDirections:
         model, measurable = functionals.disturbance, functionals.measurable
         by_block = None if model is None else model.on_blocks
         blocks = np.zeros((*states.shape, 0, 0)) if by_block is None else by_block.blocks(weights.disturbance)
-        error_sizes = functionals.bound_execution_errors(control)
+        error_sizes = functionals.bound_execution_errors(theta)
         error_pieces = np.flatnonzero(error_sizes.any(axis=0))
         error_weights = (
             weights.control[:, :, error_pieces, : functionals.channels] * error_sizes[:, error_pieces].T

@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import NamedTuple, final
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import product
@@ -391,12 +392,16 @@ def followed(errors: VaryingExecution) -> VaryingExecution | UncertainExecution:
     """Return the errors of a system that changes with time: where it has parameters, at each of them and on cells."""
     if errors.response.propagator.laws is None:
         return errors
-    return UncertainExecution(errors.response, errors.breakpoints, errors.shares, errors.error_mask, errors)
+    return UncertainExecution(
+        errors.response, errors.breakpoints, errors.shares, errors.error_mask, errors.scaling, errors
+    )
 
 
-def execution_of(response: Response, breakpoints: Array, shares: Array, error_mask: Array) -> Execution:
+def execution_of(
+    response: Response, breakpoints: Array, shares: Array, error_mask: Array, scaling: csr_array
+) -> Execution:
     """Return the errors of execution of a system, with the fields of `Execution`."""
-    arguments = response, breakpoints, shares, error_mask
+    arguments = response, breakpoints, shares, error_mask, scaling
     return followed(VaryingExecution(*arguments)) if response.system.varies else ConstantExecution(*arguments)
 
 

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import final
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from sparserob_core.control.reach.measurable import AT_ONCE, MeasurableSupport
 from sparserob_core.control.reach.support import NOT_PROVEN, Leg, Support
@@ -19,6 +20,8 @@ from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.expressions.taylor import Combination
+
+ALONE = csr_array(np.ones((1, 1)))  # one command for all times scales its own errors
 
 
 @final
@@ -80,7 +83,7 @@ class VaryingMeasurable:
             bound, through = _drop_zero_coordinates(self.bound)
         ends, error_mask = self.response.grid.breakpoints[[0, -1]], np.ones(self.response.system.states)
         execution = VaryingExecution(
-            self.response, ends, shares, error_mask, disturbing=True, bound=bound, through=through
+            self.response, ends, shares, error_mask, ALONE, disturbing=True, bound=bound, through=through
         )
         return followed(execution)
 

@@ -77,17 +77,18 @@ class Uncertainty:
         points = _sample_extreme if law == "vertices" else _sample_uniform
         return disturbances, parameters, self.functionals.response.initial_state + points(bound, count, rng)
 
-    def errors(self, law: LawName, count: int, command: Array, rng: np.random.Generator) -> Array | None:
-        """``count`` errors ``(L, m, count)`` of what is delivered of a ``command (m + constants, L)``, as shares of it
-        on the pieces of the merged grid; ``None`` where it is delivered as it is commanded. Neighbours are the worst
+    def errors(self, law: LawName, count: int, theta: Array, rng: np.random.Generator) -> Array | None:
+        """``count`` errors ``(L, m, count)`` of what is delivered of the control of a decision, on the pieces of the
+        merged grid; ``None`` where it is delivered as it is commanded. Neighbours are the worst
         errors of some functional, of the other sign on a few pieces."""
         execution = self.functionals.execution
         if execution is None or not execution.shares.any():
             return None
-        pieces, m = command.shape[1], execution.shares.size
+        sizes = self.functionals.bound_execution_errors(theta)
+        m, pieces = sizes.shape
         if law == "neighbours":
             base = rng.integers(0, self._bases[2].shape[0], size=count)
-            worst = worst_errors(self.functionals.response, execution, command, self._bases)[:, :, base]
+            worst = worst_errors(self.functionals.response, sizes, self._bases)[:, :, base]
             return np.asarray(worst * np.where(rng.uniform(size=worst.shape) < FLIPPED / pieces, -1.0, 1.0))
         if law == "slow":
             breaks = self.functionals.response.grid.breakpoints
@@ -97,7 +98,7 @@ class Uncertainty:
             shares = rng.choice([-1.0, 1.0], size=(pieces, m, count))
         else:
             shares = rng.uniform(-1.0, 1.0, size=(pieces, m, count))
-        return np.asarray(execution.shares[:, None] * shares)
+        return np.asarray(sizes.T[:, :, None] * shares)
 
     def _draw_signals(self, law: LawName, count: int, rng: np.random.Generator) -> tuple[Array | None, Array]:
         """Disturbances and parameters of `draw`."""

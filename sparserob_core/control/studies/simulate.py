@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from scipy.linalg import matrix_balance
@@ -16,9 +16,6 @@ from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.response.time_grid import TimeGrid, distinct_times
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from sparserob_core.control.reach.execution import Execution
 
 # Pieces, from which no times inside are looked at where the system hardly moves on one
 BREAKPOINTS_ONLY_PIECES = 10_000
@@ -194,22 +191,22 @@ class _TimeVaryingMotion:
 
 
 def deliver_control(command: Array, errors: Array) -> Callable[[int, Array], Array]:
-    """Return a function that gives `simulate_states` the delivered control: a ``command (m + constants, L)`` with
-    ``errors (L, m, n)``, as shares of it, in ``n`` trajectories."""
+    """Return a function that gives `simulate_states` the delivered control: a ``command (m + constants, L)`` and
+    ``errors (L, m, n)`` in ``n`` trajectories."""
 
     def acting(piece: int, state: Array) -> Array:
         inputs = np.repeat(command[:, piece, None], state.shape[1], axis=1)
-        inputs[: errors.shape[1]] *= 1.0 + errors[piece]
+        inputs[: errors.shape[1]] += errors[piece]
         return inputs
 
     return acting
 
 
-def worst_errors(response: Response, execution: Execution, command: Array, at: tuple[Array, Array, Array]) -> Array:
-    """The errors ``(L, m, k)``, constant on the pieces of a response, that raise functionals ``c'x(t)`` the most,
-    ``at`` times ``(k,)``, directions ``(k, d)`` and parameters, of a ``command (m + constants, L)`` as shares of it."""
-    weights = response.weights(*at).control[:, :, : execution.shares.size].transpose(1, 2, 0)
-    return np.asarray(execution.shares[:, None] * np.sign(weights * command[: execution.shares.size].T[:, :, None]))
+def worst_errors(response: Response, sizes: Array, at: tuple[Array, Array, Array]) -> Array:
+    """The errors ``(L, m, k)`` of at most ``sizes (m, L)``, constant on the pieces of a response, that raise
+    functionals ``c'x(t)`` the most, ``at`` times ``(k,)``, directions ``(k, d)`` and parameters."""
+    weights = response.weights(*at).control[:, :, : len(sizes)].transpose(1, 2, 0)
+    return np.asarray(sizes.T[:, :, None] * np.sign(weights))
 
 
 def trajectories_at_once(response: Response, uncertain: bool) -> int:

@@ -122,7 +122,7 @@ def build_program(posed: Posed, acting: Acting) -> Transcription:
         b = np.where(A.any(axis=1) | (np.abs(b) > TOLERANCE), b, 0.0)  # no control enters, and rounding is missing
     S, lower, upper = _build_image(posed.held, control, posed.rows)
     if functionals.execution is not None:
-        S, lower, upper = _append_sizes(S, lower, upper, functionals)
+        S, lower, upper = _append_sizes(S, lower, upper, functionals, control.pieces)
     lower, upper = np.concatenate([lower, acting_part.lower]), np.concatenate([upper, acting_part.upper])
     n = functionals.variables + acting_part.lower.size
     priced = objective(problem, control, lower.size, n)
@@ -200,7 +200,10 @@ def compute_conversion_factors(theirs: Posed, own: Transcription, units: Units) 
     steps, own_steps = (Steps.of(posed.held, posed.control) for posed in (theirs, own))
     changes = np.repeat(ratios(steps.H, own_steps.divided(rows.steps).H, controls), steps.times.size)
     extra_units = own.acting.compute_extra_units(own, units)
-    sizes = [] if own.functionals.execution is None else [np.repeat(controls, pieces)]  # bounded from both sides
+    execution = own.functionals.execution
+    sizes = (
+        [] if execution is None else [np.repeat(controls, execution.size // controls.size)]
+    )  # bounded from both sides
     decision = np.concatenate([np.repeat(controls, own.control.functions), *sizes, extra_units])
     image = np.concatenate([np.repeat(np.concatenate([controls, sides]), pieces), changes, *2 * sizes, extra_units])
     return decision, image, fixed(theirs.held)[0] @ units.states * rows.fixed
@@ -269,15 +272,17 @@ def _build_image(
 
 
 def _append_sizes(
-    S: csc_array | None, lower: Array, upper: Array, functionals: WorstFunctionals
+    S: csc_array | None, lower: Array, upper: Array, functionals: WorstFunctionals, pieces: int
 ) -> tuple[csc_array, Array, Array]:
     """Return the images of `_build_image` for a decision that continues with a bound ``a`` of the size of every value
     ``s`` of the control. Further images hold ``0 <= a - s`` and ``0 <= a + s``. Both are at most twice the largest
     ``|s|``, which ``a = |s|`` never exceeds."""
     assert functionals.execution is not None
     image = eye_array(functionals.coefficients, format="csc") if S is None else S
-    values, sizes = image[: functionals.execution.size], eye_array(functionals.execution.size, format="csc")
-    limits = 2.0 * np.maximum(np.abs(lower), np.abs(upper))[: functionals.execution.size]
+    sizes, m = eye_array(functionals.execution.size, format="csc"), functionals.channels
+    values = kron(eye_array(m), (functionals.dictionary.sparse @ functionals.execution.scaling).T)
+    reach = np.maximum(np.abs(lower), np.abs(upper))[: m * pieces].reshape(m, pieces)[:, 0]
+    limits = 2.0 * np.repeat(reach, functionals.execution.size // m)
     none = np.zeros(limits.size)
     return (
         csc_array(block_array([[image, None], [-values, sizes], [values, sizes]])),

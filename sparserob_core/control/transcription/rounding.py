@@ -170,7 +170,7 @@ def _sum_other_contributions(
     sizes += np.einsum("klm,ml->k", np.abs(weights.control), np.abs(functionals.known))
     if functionals.execution is not None:
         lengths = functionals.execution.lengths(times, functionals.execution.extend_directions(directions, parameters))
-        sizes += INTEGRATED * (lengths @ np.repeat(extent(model.problem.control), model.control.pieces))
+        sizes += INTEGRATED * (lengths @ np.repeat(extent(model.problem.control), functionals.dictionary.pieces))
     return np.asarray(sizes + _sum_disturbance_contributions(model, weights.disturbance, times, directions, parameters))
 
 

@@ -122,6 +122,11 @@ def prepare(
     mask = answers_of(policy, control.breakpoints, problem.measurements)
     if problem.execution is not None and mask.any():
         raise refusal("execution", "affine", got=f"{np.asarray(problem.execution).tolist()}")
+    if problem.jitter and mask.any():
+        raise refusal("jitter", "affine", got=f"{problem.jitter:g}")
+    if problem.jitter and not problem.jitter < control.lengths.min():
+        expected = f"less than {control.lengths.min():g}, the shortest piece of the control"
+        raise InputError(path="jitter", expected=expected, got=f"{problem.jitter:g}")
     nominal_problem, inner = problem, NO_INNER_LOOP
     if policy is not None and mask.any():
         from sparserob_core.control.transcription import feedback
@@ -179,6 +184,8 @@ def _build_inner_loop(
 def _build_functionals(
     problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary, inner: InnerLoop
 ) -> tuple[WorstFunctionals, ParameterIndex]:
+    delivery = problem.delivery
+    control = control if delivery is None else delivery.mean(control)
     system, grid = problem.system.forced, grid_of(problem, control.breakpoints, disturbance.breakpoints)
     model: DisturbanceModel | None = None
     if problem.disturbance is not None:
@@ -187,12 +194,12 @@ def _build_functionals(
     response = Response(system, grid, np.asarray(problem.initial_state, dtype=float), inner=inner)
     initial_set = problem.initial_set
     execution = None
-    if problem.execution is not None:
+    if delivery is not None:
         from sparserob_core.control.reach.varying_execution import execution_of
 
-        shares, error_mask = np.asarray(problem.execution), np.ones(problem.system.states)
+        error_mask = np.ones(problem.system.states)
         error_mask[list(problem.commanded)] = 0.0
-        execution = execution_of(response, control.breakpoints, shares, error_mask)
+        execution = execution_of(response, control.breakpoints, delivery.shares, error_mask, delivery.scaling(control))
     functionals = WorstFunctionals(
         response, control, model, names=problem.names, initial=initial_set, execution=execution
     )

@@ -165,6 +165,7 @@ def _list_unread(case: Case) -> set[str]:
             "equalities",
             *(() if unused else ("pieces",)),
             *(("tangent",) if is_tangent_read else ()),
+            *(("late",) if case.problem.jitter else ()),
         }
         multiplier_keys |= (
             {"norms"} if multipliers is not of_activity and case.problem.cost.group is not None else set()
@@ -529,7 +530,8 @@ STORED = ("theta", "control", "breakpoints", "decision")
 
 def _count_size_bounds(case: Case) -> int:
     """Return how many bounds of the control's sizes follow its coefficients in a decision."""
-    return 0 if case.problem.execution is None else case.problem.system.controls * case.control.pieces
+    m, pieces = case.problem.system.controls, case.control.pieces
+    return 0 if case.problem.delivery is None else m * (2 * pieces - 1 if case.problem.jitter else pieces)
 
 
 def _estimate_control(case: Case) -> Array:

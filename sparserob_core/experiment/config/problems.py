@@ -643,6 +643,10 @@ class ControlKeys(ProblemKeys):
     """Share of the control, from 0 to 1, by which the delivered control may differ from the command: one number per
     control, or one for all, such as 0.02. The command is delivered exactly unless given."""
 
+    jitter: float = 0.0
+    """Time by which every change of the control may come late, less than every piece of the control: until then each
+    delivered control may be anything between the old and the new value."""
+
     repeat: bool = False
     """Whether the plan is repeated for ever from the horizon on: every final state is then one of the initial states,
     and ``control_step`` also holds from the last control to the first one. Not with a delay."""
@@ -695,6 +699,7 @@ class ControlKeys(ProblemKeys):
             measurements=None if self.measurements is None else self.measurements.build(),
             repeat=self.repeat,
             execution=None if self.execution is None else broadcast("execution", self.execution, system.controls),
+            jitter=self.jitter,
         )
 
     def _expand_initial_control(self, controls: int) -> list[float] | None:

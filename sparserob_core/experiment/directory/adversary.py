@@ -92,14 +92,15 @@ def propagated(model: Transcription, theta: Array, arrays: Mapping[str, Array]) 
     disturbances = arrays["disturbances"] if arrays["disturbances"].shape[1] else None
     noises = arrays["noises"].transpose(1, 2, 0) if "noises" in arrays else None
     acting, initial_states = controlled(model, theta, grid.control_piece, noises), arrays["initial_states"]
-    execution = model.functionals.execution
-    if execution is not None and not callable(acting):
+    if model.functionals.execution is not None and not callable(acting):
         fine_grid = refine_grid(grid, times)  # an error of execution may change its sign within a piece
         command = acting[:, fine_grid.control_piece]
+        deviations = model.functionals.bound_execution_errors(model.nominal(theta))
+        sizes = deviations[:, grid.control_piece][:, fine_grid.control_piece]
         inner_response = Response(response.system, fine_grid, response.initial_state)
         fine_response = Response(response.system, refine_grid(fine_grid, times), response.initial_state)
         worst_cases = (arrays["times"], arrays["directions"], arrays["parameters"])
-        acting = deliver_control(command, worst_errors(inner_response, execution, command, worst_cases))
+        acting = deliver_control(command, worst_errors(inner_response, sizes, worst_cases))
         disturbances = None if disturbances is None else disturbances[:, :, fine_grid.disturbance_piece]
     states = np.stack(list(simulate_states(fine_response, acting, arrays["parameters"], disturbances, initial_states)))
     return times, np.ascontiguousarray(states.transpose(2, 1, 0))

@@ -13,12 +13,13 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.control.transcription.program import slanted_sides
+from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, PlainExperiment
 from sparserob_core.quantities import statistics
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Activity, Branch, Dual, Proof
-from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram
+from sparserob_core.sip.program import TOLERANCE
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.stated.statement import StatedProgram
 from sparserob_core.sip.working.unbounded import complete_multipliers
@@ -227,7 +228,8 @@ def _write_bound_proof(experiment: ControlExperiment, result: Result) -> dict[st
             if number == len(distinct_constraints):
                 distinct_constraints.append(plain)
             pairs.append([number, entry["multiplier"]])
-        nodes.append({"multipliers": pairs, "equalities": multipliers["equalities"], "feasible": node.feasible})
+        others: dict[str, Any] = {name: multipliers[name] for name in ("equalities", "late") if name in multipliers}
+        nodes.append({"multipliers": pairs, **others, "feasible": node.feasible})
     tree = {"constraints": distinct_constraints, "nodes": nodes}
     norm = {} if result.status == "infeasible" else {"J": result.sparsest.norm}
     return {"multipliers": None, **norm, "tree": tree}
@@ -261,7 +263,7 @@ def _write_multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, A
     approach. Under feedback a constraint is at a disturbance, on its own pieces ``(mw, pieces)``.
     """
     problem, program = experiment.problem, experiment.program
-    z = dual.z if problem.execution is None or dual.z is None else _remove_size_multipliers(program, dual.z)
+    z, late = _split_multipliers(experiment.transcription, dual.z)
     steps = Steps.of(problem, experiment.control)
     pairs = zip(dual.cuts, experiment.transcription.explained(dual.cuts), strict=True)
     explained = [(cut, explanation) for cut, explanation in pairs if explanation is not None]
@@ -286,6 +288,7 @@ def _write_multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, A
             for t, c, y in ([] if z is None or not steps.count else steps.priced(z[-steps.count :]))
         ],
         "equalities": dual.mu,
+        **({} if late is None else {"late": late}),
         "pieces": _sum_piece_multipliers(problem, z, experiment.control.pieces),
         **(
             {}
@@ -300,14 +303,21 @@ def _write_multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, A
     }
 
 
-def _remove_size_multipliers(program: SemiInfiniteProgram, z: Array) -> Array:
-    """Return multipliers of the images without those of the bounds of the control's sizes.
+def _split_multipliers(model: Transcription, z: Array | None) -> tuple[Array | None, Array | None]:
+    """Return multipliers of the images without those of the bounds of sizes; and those of changes ``(m, K - 1)`` that
+    may come late, ``None`` where every size is that of a value.
 
-    Two bounds limit each value, one from either side; their multipliers enter with opposite signs.
+    Two bounds limit each size, one from either side; their multipliers enter with opposite signs.
     """
-    size = program.image_size
+    execution = model.functionals.execution
+    if z is None or execution is None:
+        return z, None
+    size, m, values = execution.size, model.problem.system.controls, model.program.image_size
     above, below = z[-2 * size : -size], z[-size:]
-    return np.concatenate([z[:size] - above + below, z[size : -2 * size]])
+    sizes = (below - above).reshape(m, -1)
+    if not model.problem.jitter:
+        return np.concatenate([z[:values] + sizes.ravel(), z[values : -2 * size]]), None
+    return z[: -2 * size], sizes[:, 1::2]
 
 
 def _sum_piece_multipliers(problem: OptimalControlProblem, z: Array | None, pieces: int) -> Array | None:

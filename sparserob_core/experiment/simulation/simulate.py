@@ -171,7 +171,7 @@ def _simulate_samples(
         control = controlled(model, finished.decision, np.arange(response.grid.pieces), noise_signals)
         if callable(control):
             control = acting.of(control)
-        elif (errors := uncertainty.errors(law, size, control, rng)) is not None:
+        elif (errors := uncertainty.errors(law, size, model.nominal(finished.decision), rng)) is not None:
             control = deliver_control(control, errors)
         for violation_count in violation_counts:
             violation_count.begin(size)

@@ -157,6 +157,10 @@ def problems() -> list[sr.OptimalControlProblem]:
         ),
         sr.OptimalControlProblem(
             system=sr.LinearSystem([[0.5, 2.0], [-3.0, 0.25]], [[0.75], [1.5]]), horizon=3.0, initial_state=[1.5, -0.5],
+            control=sr.Box([-3.0], [1.25]), jitter=0.375,
+        ),
+        sr.OptimalControlProblem(
+            system=sr.LinearSystem([[0.5, 2.0], [-3.0, 0.25]], [[0.75], [1.5]]), horizon=3.0, initial_state=[1.5, -0.5],
             control=sr.Box([-3.0], [1.25]),
             disturbances=[sr.Disturbance(sr.Box([-0.5], [0.5]), [[1.25], [0.5]], breakpoints=[0.0, 1.25, 3.0])],
         ),

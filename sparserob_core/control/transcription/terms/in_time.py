@@ -34,7 +34,7 @@ def follow_in_time(problem: OptimalControlProblem) -> OptimalControlProblem:
     if system.varies:
         return problem
     plain = not (system.switches or system.parameter_count)
-    if problem.execution is not None:
+    if problem.delivery is not None:
         return problem if plain else replace(problem, system=system.in_time(problem.horizon))
     if problem.measurable is None or not system.parameter_count:
         return problem

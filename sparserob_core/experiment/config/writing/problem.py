@@ -31,7 +31,7 @@ from sparserob_core.sip.expressions.expression import ExpressionMatrix
 WRITTEN = {
     "system", "horizon", "initial_state", "control", "initial_set", "weights", "disturbance", "disturbance_class",
     "terminal", "title", "initial_control", "control_step", "names", "cost", "disturbances",
-    "measurements", "repeat", "execution", "disturbance_breakpoints",
+    "measurements", "repeat", "execution", "jitter", "disturbance_breakpoints",
     "commanded",
 }  # fmt: skip
 """The fields of a problem that are written in addition to lists of constraints; any other field is an error."""
@@ -81,6 +81,8 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
         keys["repeat"] = True
     if problem.execution is not None:
         keys["execution"] = np.asarray(problem.execution).tolist()
+    if problem.jitter:
+        keys["jitter"] = problem.jitter
     return keys
 
 

@@ -77,7 +77,7 @@ def _derive_bound(experiment: ControlExperiment, result: Result, deadline: Deadl
     if result.status not in ("certified", "verified") or tolerance is None or result.stopped:
         return rounded
     feedback = experiment.transcription.feedback
-    exact = experiment.problem.execution is None and (
+    exact = experiment.problem.delivery is None and (
         feedback is None or (feedback.loop.spread.is_box and not feedback.loop.inner.acts)
     )
     if exact and rounded.gap <= tolerance + SMALL_GAP:
