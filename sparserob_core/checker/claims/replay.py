@@ -24,7 +24,7 @@ from sparserob_core.checker.claims.units import units_of
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.states import States
 from sparserob_core.checker.reach.tube import LoopTube, Polynomial, ProjectedStates, VerifiedTube
-from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.known import admit, known
 from sparserob_core.checker.sets.shape import along, basis_of
 from sparserob_core.sip.convex_set import Array
 
@@ -269,4 +269,6 @@ def _read_disturbance(case: Case, signal: object) -> Array:
             raise Broken(
                 f"the disturbance {w[:, k].tolist()} at t = {case.timing.grid[k]:.6g} is not shown to be in its set"
             )
+    if not admit(bound, np.diff(case.timing.grid), w):
+        raise Broken("the disturbance is not shown to keep its budget")
     return w

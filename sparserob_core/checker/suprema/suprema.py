@@ -20,7 +20,7 @@ from sparserob_core.checker.claims.multipliers import admissible
 from sparserob_core.checker.claims.replay import compute_value
 from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.outcome import FIGURES, TOLERANCE, Broken, Finding, Unchecked
-from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.known import admit, known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD
 from sparserob_core.checker.sets.shape import basis_of
 from sparserob_core.checker.sets.sides import Bounded, Sides
@@ -203,6 +203,8 @@ def _read_signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | N
         if value not in shown_values and not shape.contains(value):
             raise Broken(f"the disturbance {list(value)} is not shown to be in its set")
         shown_values.add(value)
+    if not admit(problem.disturbance, np.diff(changes), signal):
+        raise Broken("the disturbance is not shown to keep its budget")
     return changes, signal
 
 

@@ -23,6 +23,8 @@ def refuse_remaining(model: Transcription) -> None:
         "a disturbance that takes any value on each of its pieces, since what is left of another depends on what has"
         " been": "l1_ball" in classes or (classes == {"piecewise_constant"} and not model.disturbance.is_complete),
         "disturbances of one class": len(classes) > 1,
+        "a disturbance without a budget, since what is left of it is not measured": problem.disturbance is not None
+        and not problem.disturbance.is_pointwise,
         "disturbances on the pieces of one dictionary": problem.disturbance_breakpoints is not None,
         "integrals of controls alone, and none beside feedback: what states add up to between measurements is not"
         " known": any(model.feedback is not None or np.any(entry.H) for entry in combine_states(model.stated).integral),

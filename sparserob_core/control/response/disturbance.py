@@ -163,6 +163,7 @@ class DisturbanceModel:
                 values[..., columns] = points[..., first_blocks, columns]
             return np.swapaxes(values, -1, -2)
         assert self.functions is not None
+        points = self.set.inside(points)
         coefficients = points if self.scale is not None else points.reshape(*points.shape[:-2], self.channels, -1)
         signal = np.einsum("...ij,jl->...il", coefficients, self.functions)
         answer: Array = signal if self.scale is None else signal * self.scale[:, None]
@@ -198,6 +199,12 @@ def disturbance_model(
             "l1_ball", ball, bound, grid, functions=dictionary.at(grid.disturbance_piece), scale=box.upper
         )
     merged = dictionary.merged()
+    if not bound.is_pointwise:  # one block, of the values on all pieces
+        values = dictionary.at(grid.disturbance_piece)
+        if not dictionary.is_indicators:
+            raise InputError("a budget needs a dictionary of one function for each piece", path="dictionaries.disturbance")
+        signals = bound.of_signals(values @ np.diff(grid.breakpoints))
+        return DisturbanceModel("piecewise_constant", signals, bound, grid, functions=values)
     if dictionary.is_complete:
         piece_indices = np.clip(
             np.searchsorted(merged.breakpoints, _compute_middles(grid), side="right") - 1,

@@ -90,6 +90,9 @@ def shorten_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalCo
     if problem.disturbance_breakpoints is not None:
         expected = "disturbances on the pieces of their dictionary, which become shorter with the horizon"
         raise InputError(path="disturbance", expected=expected, got="breakpoints of their own")
+    if problem.disturbance is not None and not problem.disturbance.is_pointwise:
+        expected = "a disturbance without a budget, which would have to change with the horizon; leave the budget out"
+        raise InputError(path="disturbance", expected=expected, got="a budget over the horizon")
     if problem.system.varies:
         expected = "a system that stays the same with time: of another one no shorter horizon is looked at yet"
         raise InputError(path="system", expected=expected, got="one in t")

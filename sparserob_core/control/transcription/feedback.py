@@ -302,6 +302,9 @@ def refuse(
         "system without uncertain parameters: else what is measured is not the disturbance alone": uncertain,
         f"disturbance of the class piecewise_constant, not {' and '.join(sorted(classes))}{finer}": not classes
         <= {"piecewise_constant"},
+        "disturbance without a budget: beside a policy leave it out, which covers every signal that it admits": (
+            problem.disturbance is not None and not problem.disturbance.is_pointwise
+        ),
         "disturbance on the pieces of one dictionary, not on some of its own": problem.disturbance_breakpoints
         is not None,
         f"set of disturbances and of initial states with an interior, or with sides that can be listed, which the"
