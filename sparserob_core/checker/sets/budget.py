@@ -149,10 +149,13 @@ class Budgeted(Shape):
         multipliers = self._choose_multipliers(sizes)
         point = self._respond(sizes, multipliers)
         if source.p == 1:
-            left = np.maximum(source.size - (source.costs * point).sum(axis=1), 0.0)
-            k = np.arange(len(values))
-            j = np.where(point < source.radii, sizes / source.costs, -1.0).argmax(axis=1)
-            point[k, j] = np.clip(point[k, j] + left / source.costs[j], 0.0, source.radii[j])
+            open_cost = source.costs * np.where(sizes > 0.0, source.radii - point, 0.0)
+            order = np.argsort(-sizes / source.costs, axis=1)  # several may be equally good
+            ordered = np.take_along_axis(open_cost, order, axis=1)
+            left = np.maximum(source.size - (source.costs * point).sum(axis=1), 0.0)[:, None]
+            filled = np.clip(left - (ordered.cumsum(axis=1) - ordered), 0.0, ordered)
+            np.put_along_axis(open_cost, order, filled, axis=1)
+            point = point + open_cost / source.costs
         return np.asarray(np.sign(values) * point)
 
     @cached_property
