@@ -511,7 +511,9 @@ class OptimalControlProblem(Term):
             return
         checked_set("disturbance", self.disturbance, self.system.disturbances, "columns of E", bounded=True)
         if not self.disturbance.is_pointwise and kinds != "piecewise_constant":
-            expected = "disturbance_class piecewise_constant beside a budget; more pieces in dictionaries.disturbance come"
+            expected = (
+                "disturbance_class piecewise_constant beside a budget; more pieces in dictionaries.disturbance come"
+            )
             raise InputError(
                 path="disturbance_class",
                 expected=f"{expected} as close to a measurable disturbance as is wanted",

@@ -13,7 +13,7 @@ from sparserob_core.shapes import Float, sealed, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 # Share of itself by which a signal is shortened, so that it is inside although its sums are rounded. A hundredth of it
-# is the rounding itself; with a thousand times as much, the values of worst signals would lose a digit that is reported.
+# is the rounding itself; with a thousand times as much, values of worst signals would lose a digit that is reported.
 INSIDE = 1e-13
 
 
@@ -98,9 +98,7 @@ class BudgetedBox(Box):
     @shaped
     def in_units(self, units: Float[Array, " d"]) -> BudgetedBox:
         units = np.asarray(units, dtype=float)
-        return BudgetedBox(
-            self.lower / units, self.upper / units, self.p, self.size, self.rates * units**self.p
-        )
+        return BudgetedBox(self.lower / units, self.upper / units, self.p, self.size, self.rates * units**self.p)
 
     def in_units_of_time(self, unit: float) -> BudgetedBox:
         return BudgetedBox(self.lower, self.upper, self.p, self.size / unit, self.rates)
