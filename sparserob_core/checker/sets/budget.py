@@ -125,8 +125,9 @@ class Budgeted(Shape):
         """Return the maximisers of ``size x - lambda h x^p`` over ``0 <= x <= r``, for ``sizes (k, d)``."""
         radii, prices = self.source.radii, multipliers * self.source.costs
         if self.source.p == 1:
-            return np.where(sizes > prices, radii, 0.0)
-        return np.where(prices > 0.0, np.minimum(sizes / np.where(prices > 0.0, 2.0 * prices, 1.0), radii), radii)
+            return np.asarray(np.where(sizes > prices, radii, 0.0))
+        bound = np.minimum(sizes / np.where(prices > 0.0, 2.0 * prices, 1.0), radii)
+        return np.asarray(np.where(prices > 0.0, bound, radii))
 
     def _choose_multipliers(self, sizes: Array) -> Array:
         """Return multipliers ``(k, 1)`` near the best ones: where they are larger the budget is not spent."""

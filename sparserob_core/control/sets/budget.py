@@ -69,7 +69,7 @@ class BudgetedBox(Box):
         if not self.is_bounded or (self.lower != -self.upper).any():
             expected = "a bounded box that is symmetric about 0, such as box: 0.1, beside a budget"
             raise InputError(path="box", expected=expected, got=f"{self.lower.tolist()} to {self.upper.tolist()}")
-        if isinstance(self.p, bool) or self.p not in (1, 2):
+        if self.p not in (1, 2):
             raise InputError(path="budget.p", expected="1 or 2", got=f"{self.p!r}")
         if isinstance(self.size, bool) or not isinstance(self.size, int | float) or not 0.0 < self.size < np.inf:
             raise InputError(path="budget.size", expected="a positive number", got=f"{self.size!r}")
