@@ -142,7 +142,7 @@ class Budgeted(Shape):
             middle = (low + high) / 2.0
             spent = (source.costs * self._respond(sizes, middle) ** source.p).sum(axis=1, keepdims=True)
             low, high = np.where(spent > source.size, middle, low), np.where(spent > source.size, high, middle)
-        return high
+        return np.asarray(high)
 
     def _choose_points(self, values: Array) -> Array:
         """Return points ``(k, d)`` near the farthest ones: the response to the multiplier, filled up to the budget."""

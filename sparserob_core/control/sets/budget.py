@@ -71,7 +71,7 @@ class BudgetedBox(Box):
             raise InputError(path="box", expected=expected, got=f"{self.lower.tolist()} to {self.upper.tolist()}")
         if self.p not in (1, 2):
             raise InputError(path="budget.p", expected="1 or 2", got=f"{self.p!r}")
-        if isinstance(self.size, bool) or not isinstance(self.size, int | float) or not 0.0 < self.size < np.inf:
+        if not 0.0 < self.size < np.inf:
             raise InputError(path="budget.size", expected="a positive number", got=f"{self.size!r}")
         object.__setattr__(self, "rates", np.broadcast_to(np.array(self.rates, dtype=float), self.lower.shape).copy())
         sealed(self)
