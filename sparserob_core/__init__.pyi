@@ -20,6 +20,7 @@ from sparserob_core.control.problem.terms.integral import IntegralConstraint as 
 from sparserob_core.control.problem.terms.windows import MixedConstraint as MixedConstraint
 from sparserob_core.control.problem.terms.windows import PathConstraint as PathConstraint
 from sparserob_core.control.problem.problem import ProblemFactory as ProblemFactory
+from sparserob_core.control.sets.budget import BudgetedBox as BudgetedBox
 from sparserob_core.control.sets.sets import Ellipsoid as Ellipsoid
 from sparserob_core.control.sets.sets import Equality as Equality
 from sparserob_core.control.sets.sets import NormBall as NormBall

@@ -168,6 +168,11 @@ REFUSALS: dict[str, dict[str, Refusal]] = {
             ("measurable", "two classes"),
         ),
         "l1_ball": Refusal("feedback needs a disturbance of the class piecewise_constant, not {}", "policy.name"),
+        "budget": Refusal(
+            "feedback needs a disturbance without a budget: beside a policy leave it out, which covers every signal"
+            " that it admits",
+            "policy.name",
+        ),
         "pieces of their own": Refusal(
             "feedback needs a disturbance on the pieces of one dictionary, not on some of its own",
             "policy.name",
@@ -226,6 +231,11 @@ REFUSALS: dict[str, dict[str, Refusal]] = {
             "resolve",
         ),
         "two classes": Refusal("solving the remaining horizon needs disturbances of one class", "resolve"),
+        "budget": Refusal(
+            "solving the remaining horizon needs a disturbance without a budget, since what is left of it is not"
+            " measured",
+            "resolve",
+        ),
         "pieces of their own": Refusal(
             "solving the remaining horizon needs disturbances on the pieces of one dictionary", "resolve"
         ),
@@ -247,6 +257,10 @@ REFUSALS: dict[str, dict[str, Refusal]] = {
     "horizon": {
         "pieces of their own": Refusal(
             "disturbances on the pieces of their dictionary, which become shorter with the horizon", "disturbance"
+        ),
+        "budget": Refusal(
+            "a disturbance without a budget, which would have to change with the horizon; leave the budget out",
+            "disturbance",
         ),
         "entries in t": Refusal(
             "a system that stays the same with time: of another one no shorter horizon is looked at yet", "system"

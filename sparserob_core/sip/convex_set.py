@@ -193,6 +193,43 @@ class ConvexSet(ABC):
         axes = np.eye(self.dimension)
         return bool(np.isfinite(self.support(np.vstack([axes, -axes]))).all())
 
+    # Values of a signal
+
+    @property
+    def is_pointwise(self) -> bool:
+        """True where a signal is admissible as soon as all its values are in the set."""
+        return True
+
+    @shaped
+    def of_signals(self, lengths: Float[Array, " n"]) -> ConvexSet:
+        """Return the set of signals ``(d n,)`` that are constant on intervals, one coordinate after another.
+
+        Parameters
+        ----------
+        lengths : ndarray, shape (n,)
+            Lengths of the intervals.
+
+        Returns
+        -------
+        ConvexSet
+            The signals.
+
+        Raises
+        ------
+        NotImplementedError
+            Where the set is pointwise: then the signals are a product, of one set for each interval.
+        """
+        raise NotImplementedError(f"the values of a {self.kind} are not coupled")
+
+    def in_units_of_time(self, unit: float) -> ConvexSet:
+        """Return the set where times are counted in this unit; only a set that couples values depends on it."""
+        return self
+
+    @shaped
+    def inside(self, points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
+        """Return points of the set nearest to rounded ``points (..., d)`` of it; by default the points themselves."""
+        return points
+
     # Size
 
     def bounding_box(self) -> Box:

@@ -61,6 +61,7 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "experiment3_repaired": ("certified", 1.11230, 2e-5),
     "haar": ("certified", 0.537592, 5e-6),
     "energy_budget": ("certified", 82.7081503, 1e-8),
+    "gust_budget": ("certified", 4.0522442, 2e-8),
     "heated_house": ("certified", None, 0.0),
     "output_feedback": ("certified", 0.9351872, 1e-6),
     "initial_set": ("certified", 0.502958, 1e-6),

@@ -33,12 +33,15 @@ from functools import cached_property, singledispatch
 from pathlib import Path
 from typing import Any
 
+import clarabel
 import numpy as np
 from scipy.linalg import expm
 from scipy.optimize import linprog
+from scipy.sparse import csc_array
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.terms.windows import MixedConstraint
+from sparserob_core.control.sets.budget import BudgetedBox
 from sparserob_core.control.sets.curved import Ellipsoid, NormBall
 from sparserob_core.control.sets.polytope import Polytope
 from sparserob_core.control.sets.sets import Box, Product
@@ -111,6 +114,42 @@ def _(convex: Product, c: Array) -> Array:
     return np.concatenate([support_point(one, part) for one, part in parts], axis=-1)
 
 
+@dataclass(frozen=True)
+class Signals:
+    """Signals ``(n mw,)`` on pieces of such ``lengths``, piece after piece, in a box with a budget."""
+
+    values: BudgetedBox
+    lengths: Array
+
+    @property
+    def dimension(self) -> int:
+        return self.values.dimension * self.lengths.size
+
+
+@support_point.register
+def _(convex: Signals, c: Array) -> Array:
+    """By linear programs of the positive and the negative part, or by cones."""
+    box, radii = convex.values, np.tile(convex.values.upper, convex.lengths.size)
+    costs = np.repeat(convex.lengths, box.dimension)
+    points = []
+    for row in c.reshape(-1, convex.dimension):
+        size = float(np.abs(row).max(initial=0.0)) or 1.0
+        if box.p == 1:
+            bounds = list(zip(np.zeros(2 * radii.size), np.tile(radii, 2), strict=True))
+            parts = linprog(np.append(-row, row) / size, np.append(costs, costs)[None], [box.size], bounds=bounds).x
+            points.append(parts[: radii.size] - parts[radii.size :])
+        else:
+            eye = np.eye(radii.size)
+            G = csc_array(np.vstack([eye, -eye, np.zeros((1, radii.size)), -np.diag(np.sqrt(costs))]))
+            h = np.concatenate([radii, radii, [np.sqrt(box.size)], np.zeros(radii.size)])
+            cones = [clarabel.NonnegativeConeT(2 * radii.size), clarabel.SecondOrderConeT(1 + radii.size)]
+            settings = clarabel.DefaultSettings()
+            settings.verbose = False
+            nothing = csc_array((radii.size, radii.size))
+            points.append(clarabel.DefaultSolver(nothing, -row / size, G, h, cones, settings).solve().x)
+    return np.array(points).reshape(c.shape)
+
+
 def vertices(H: Array, h: Array) -> Array:
     """The corners of a bounded polytope in few dimensions: every choice of as many sides that meet in one of its
     points."""
@@ -159,6 +198,7 @@ class Source:
     bound: ConvexSet
     pieces: Array | None
     known: Array
+    lengths: Array | None = None  # of the pieces, where a budget couples them
 
 
 @dataclass
@@ -278,7 +318,8 @@ class Plan:
                 found.append(Source(columns, part, None, np.zeros(0)))
             elif kind == "piecewise_constant":
                 known = np.searchsorted(self.breakpoints, ends[1:] - 1e-9)
-                found.append(Source(columns, part, self.piece(ends, self.middles), known))
+                source = Source(columns, part, self.piece(ends, self.middles), known)
+                found.append(replace(source, lengths=np.diff(ends)) if isinstance(part, BudgetedBox) else source)
             else:
                 raise NotImplementedError(f"no oracle for disturbances of the class {kind}")
         return found
@@ -286,7 +327,12 @@ class Plan:
     @cached_property
     def blocks(self) -> list[tuple[ConvexSet, int]]:
         """What is constant: the set and from which piece of the control on it is known; the initial deviation last."""
-        found = [(one.bound, int(k)) for one in self.sources if one.pieces is not None for k in one.known]
+        found: list[tuple[ConvexSet, int]] = []
+        for one in self.sources:
+            if one.lengths is not None:
+                found.append((Signals(one.bound, one.lengths), int(one.known[-1])))
+            elif one.pieces is not None:
+                found += [(one.bound, int(k)) for k in one.known]
         start = self.problem.initial_set
         return [*found, *([] if start is None else [(start, 0)])]
 
@@ -383,7 +429,7 @@ class Flow:
                 continue
             sums = np.zeros((one.known.size, R, pushed.shape[2]))
             np.add.at(sums, one.pieces[:j], pushed.transpose(1, 0, 2))
-            blocks += list(sums)
+            blocks += list(sums) if one.lengths is None else [sums.transpose(1, 0, 2).reshape(R, -1)]
         blocks += [] if problem.initial_set is None else [back[:, : problem.system.states]]
         sizes = on_size[:, :, :K].reshape(R, -1), on_change.reshape(R, -1)
         flat = (on_u[:, :, :K].reshape(R, -1), np.hstack(sizes))

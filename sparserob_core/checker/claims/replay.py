@@ -24,7 +24,7 @@ from sparserob_core.checker.claims.units import units_of
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.states import States
 from sparserob_core.checker.reach.tube import LoopTube, Polynomial, ProjectedStates, VerifiedTube
-from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.known import admit, known
 from sparserob_core.checker.sets.shape import along, basis_of
 from sparserob_core.control.problem.disturbances import columns_of
 from sparserob_core.sip.convex_set import Array
@@ -262,21 +262,23 @@ def _read_disturbance(case: Case, signal: object) -> Array:
         raise Broken(f"disturbance: expected {bound.dimension} rows, got shape {w.shape}")
     if w.shape[1] != len(case.timing.grid) - 1:
         raise Unchecked("the disturbance is given on another grid")
-    require_admissible(case, w, case.timing.grid[:-1])
+    require_admissible(case, w, case.timing.grid)
     return w
 
 
-def require_admissible(case: Case, signal: Array, starts: Sequence[float]) -> None:
-    """Raise `Broken` unless a disturbance ``(mw, M)``, whose values begin at ``starts (M,)``, jumps only where it may,
-    and is shown to be in its set."""
+def require_admissible(case: Case, signal: Array, times: Sequence[float]) -> None:
+    """Raise `Broken` unless a disturbance ``(mw, M)``, whose values change at ``times (M + 1,)``, jumps only where it
+    may, and is shown to be in its set."""
     bound = case.problem.disturbance
     assert bound is not None
     is_held = ~columns_of(bound, case.problem.disturbance_class, "measurable")
-    for time, jumping in zip(starts[1:], ((signal[:, 1:] != signal[:, :-1]) & is_held[:, None]).T, strict=True):
+    for time, jumping in zip(times[1:-1], ((signal[:, 1:] != signal[:, :-1]) & is_held[:, None]).T, strict=True):
         if jumping.any() and (jumping & ~case.disturbances.may_jump(time)).any():
             raise Broken(f"the disturbance jumps within a piece, at t = {time:.6g}")
     shown_values = set[tuple[float, ...]]()
-    for time, value in zip(starts, case.clock.each(map(tuple, signal.T.tolist())), strict=True):
+    for time, value in zip(times[:-1], case.clock.each(map(tuple, signal.T.tolist())), strict=True):
         if value not in shown_values and not known(bound).contains(value):
             raise Broken(f"the disturbance {list(value)} at t = {time:.6g} is not shown to be in its set")
         shown_values.add(value)
+    if not admit(bound, np.diff(times), signal):
+        raise Broken("the disturbance is not shown to keep its budget")

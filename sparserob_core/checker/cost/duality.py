@@ -25,7 +25,7 @@ from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.problem.held import HeldComponents, summed
 from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.reach.followed import FollowedRows
-from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.known import known, sum_supports
 from sparserob_core.checker.sets.shape import find_range
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -135,8 +135,9 @@ class Duality:
             constant = constant + known(problem.initial_set).support(initial_slope)
         if disturbed and self.held is not None:
             block_slopes = self.compute_disturbance_weights(direction, time, parameter)
-            for block_slope in summed(self.held_components, block_slopes):
-                constant = constant + known(self.held).support(block_slope)
+            lengths = np.diff([*(self.changes or ()), problem.horizon])
+            slopes = summed(self.held_components, block_slopes)
+            constant = constant + sum_supports(self.held, lengths, slopes)
         return ConstraintRow(constant, slope)
 
     def compute_disturbance_weights(

@@ -35,8 +35,10 @@ class Disturbances:
 
     @property
     def alike(self) -> bool:
-        """True where all disturbances are of one class, and those on pieces are constant on the same pieces."""
-        return not self.several and self.held_components is None
+        """True where all disturbances are of one class, and those on pieces are constant on the same pieces, any value
+        of the set on each."""
+        is_coupled = self.problem.disturbance is not None and not self.problem.disturbance.is_pointwise
+        return not self.several and self.held_components is None and not is_coupled
 
     def may_jump(self, time: float) -> np.ndarray:
         """Return which components ``(mw,)`` of the disturbance may have another value from a time on, among those that

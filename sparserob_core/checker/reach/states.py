@@ -21,6 +21,7 @@ from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.segment import Powers, VerifiedSegment, shifted
 from sparserob_core.checker.problem.held import HeldComponents
+from sparserob_core.checker.sets.budget import couple
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -193,7 +194,9 @@ class States:
             mid, rad = (np.add.reduceat(values, firsts, axis=0) for values in (mid, rad))
             if scene.held_components is not None:
                 mid, rad = scene.held_components.gathered(mid, rad)
-            effects.append((scene.disturbance, Enclosed(mid, rad)))
+            lengths = np.diff([*scene.changes, scene.grid[-1]])[: len(mid)]
+            coupled, mid, rad = couple(scene.disturbance, lengths, mid, rad)
+            effects.append((coupled, Enclosed(mid, rad)))
         if scene.initial_set is not None:
             initial = ring(flow.monomials, propagated_rows, self.effect(place)[0])
             effects.append((scene.initial_set, initial.swapped(2, 3)[None]))

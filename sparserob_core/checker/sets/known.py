@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from flint import ctx
+from flint import arb, ctx
 
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.sets.along import NormSummand
+from sparserob_core.checker.sets.budget import Budgeted
 from sparserob_core.checker.sets.curved import Ball, Cylindrical, Ellipsoidal, Joint
 from sparserob_core.checker.sets.flat import Boxed, Octahedral, Polyhedral, Segments
-from sparserob_core.checker.sets.shape import Shape
+from sparserob_core.checker.sets.shape import Shape, total
 from sparserob_core.checker.sets.summands import Summand
+from sparserob_core.control.sets.budget import BudgetedBox, BudgetedSignals
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Product, Zonotope
 from sparserob_core.sip.convex_set import Array
 
@@ -31,6 +33,8 @@ def _build_ball(source: NormBall) -> Shape:
 KINDS: Mapping[type[ConvexSet], Callable[[Any], Shape]] = MappingProxyType(
     {
         Box: Boxed,
+        BudgetedBox: Boxed,
+        BudgetedSignals: Budgeted,
         Polytope: Polyhedral,
         Ellipsoid: Ellipsoidal,
         NormBall: _build_ball,
@@ -65,3 +69,18 @@ def middle(shape: ConvexSet) -> Array:
 def summands_of(shape: ConvexSet) -> list[Summand | NormSummand]:
     """Return sets whose sum is a bounded set minus its `middle`, as `Shape.summands` does."""
     return known(shape).summands(middle(shape))
+
+
+def sum_supports(bound: ConvexSet, lengths: Array, weights: Sequence[Sequence[arb]]) -> arb:
+    """Return the largest sum over pieces of ``weights[l]'w_l``, for a disturbance in a set that is constant on pieces
+    of such ``lengths``."""
+    if bound.is_pointwise:
+        return total(known(bound).support(row) for row in weights)
+    signals = bound.of_signals(lengths[: len(weights)])
+    return known(signals).support([row[i] for i in range(bound.dimension) for row in weights])
+
+
+def admit(bound: ConvexSet, lengths: Array, signal: Array) -> bool:
+    """Return True where the values ``(mw, n)`` of a signal on pieces, each in the set, are shown to be a signal of it;
+    raise `Unchecked` where rounding may have moved it out of the set."""
+    return bound.is_pointwise or known(bound.of_signals(lengths)).contains(signal.ravel())

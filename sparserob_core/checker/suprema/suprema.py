@@ -192,7 +192,7 @@ def _read_signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | N
             raise Broken("a disturbance is written, there is none")
         return changes, None
     signal = shaped(entry, "disturbance", (problem.disturbance.dimension, changes.size - 1))
-    require_admissible(case, signal, changes[:-1].tolist())
+    require_admissible(case, signal, changes.tolist())
     return changes, signal
 
 

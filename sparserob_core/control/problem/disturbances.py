@@ -301,4 +301,7 @@ def _check_set(where: str, bound: object, phase: Phase) -> ConvexSet:
         raise InputError(path=where, expected=expected, got=f"dimension {bound.dimension}")
     if not bound.is_bounded:
         raise InputError("the set must be bounded", path=where)
+    if not bound.is_pointwise:
+        expected = "a set without a budget: of a list none has one; write a single disturbance, of all columns of E"
+        raise InputError(path=where, expected=expected, got=f"a {bound.kind} with a budget")
     return bound

@@ -63,6 +63,11 @@ SYSTEM = {
     "remaining": lambda system, begin, horizon: system.remaining(begin, horizon),
 }
 
+DISTURBANCE = {
+    "in_units": lambda bound, units: bound.in_units(units.disturbances).in_units_of_time(units.time),
+    "remaining": lambda bound, begin, horizon: bound,
+}
+
 
 def _shift_breakpoints(times: Array, begin: float, horizon: float) -> Array:
     """Return breakpoints from the time ``begin`` on, counted from there.
@@ -202,7 +207,7 @@ class OptimalControlProblem(Term):
     control: ConvexSet = field(metadata=CONTROLS)
     initial_set: ConvexSet | None = field(default=None, metadata=STATES)
     weights: npt.ArrayLike | None = field(default=None, metadata=WEIGHTS)
-    disturbance: ConvexSet | None = field(default=None, metadata=measured(lambda of: of.disturbances))
+    disturbance: ConvexSet | None = field(default=None, metadata=DISTURBANCE)
     disturbance_class: Classes = field(default="piecewise_constant", metadata=UNITLESS)
     path: Sequence[PathConstraint | MixedConstraint | ConvexSet] = field(default=(), metadata=each(PathConstraint))
     terminal: Sequence[ConvexSet | Equality] = field(default=(), metadata=STATES)
@@ -535,6 +540,15 @@ class OptimalControlProblem(Term):
         if self.disturbance is None:
             return
         checked_set("disturbance", self.disturbance, self.system.disturbances, "columns of E", bounded=True)
+        if not self.disturbance.is_pointwise and kinds != "piecewise_constant":
+            expected = (
+                "disturbance_class piecewise_constant beside a budget; more pieces in dictionaries.disturbance come"
+            )
+            raise InputError(
+                path="disturbance_class",
+                expected=f"{expected} as close to a measurable disturbance as is wanted",
+                got=f"{kinds}",
+            )
         box = self.disturbance.bounding_box()
         symmetric = self.disturbance.is_box and np.array_equal(box.lower, -box.upper)
         if self.disturbance_class == "l1_ball" and not symmetric:

@@ -164,6 +164,7 @@ class DisturbanceModel:
                 values[..., columns] = points[..., first_blocks, columns]
             return np.swapaxes(values, -1, -2)
         assert self.functions is not None
+        points = self.set.inside(points)
         coefficients = points if self.scale is not None else points.reshape(*points.shape[:-2], self.channels, -1)
         signal = np.einsum("...ij,jl->...il", coefficients, self.functions)
         answer: Array = signal if self.scale is None else signal * self.scale[:, None]
@@ -180,6 +181,8 @@ def disturbance_model(
     ``||beta_i||_1 <= bound_i`` per channel (the paper's sufficient condition read as an uncertainty set, far smaller).
     ``breakpoints``: the breakpoints of every part of a product; they are among those of the dictionary.
     """
+    if not bound.is_pointwise:
+        return _join_pieces(bound, dictionary, grid)
     if kind == "measurable":
         return DisturbanceModel("measurable", bound, bound, grid, starts=np.arange(grid.pieces))
     if not isinstance(kind, str):
@@ -188,13 +191,7 @@ def disturbance_model(
         alone = disturbance_model("piecewise_constant", bound, dictionary, grid)
         return replace(alone, kind="several", classes=kind)
     if kind == "l1_ball":
-        box = bound.bounding_box()
-        if not bound.is_box or not np.array_equal(box.lower, -box.upper):
-            raise InputError("l1_ball needs a disturbance box that is symmetric about 0", path="disturbance_class")
-        ball = NormBall(p=1.0, radius=1.0, dimension=dictionary.functions)
-        return DisturbanceModel(
-            "l1_ball", ball, bound, grid, functions=dictionary.at(grid.disturbance_piece), scale=box.upper
-        )
+        return _bound_coefficients(bound, dictionary, grid)
     merged = dictionary.merged()
     if dictionary.is_complete:
         piece_indices = np.clip(
@@ -219,6 +216,26 @@ def disturbance_model(
     rows = np.einsum("ri,jk->krij", H, merged.values).reshape(-1, H.shape[1] * merged.values.shape[0])
     coupled = Polytope(rows, np.tile(h, merged.pieces))
     return DisturbanceModel("piecewise_constant", coupled, bound, grid, functions=dictionary.at(grid.disturbance_piece))
+
+
+def _bound_coefficients(bound: ConvexSet, dictionary: Dictionary, grid: TimeGrid) -> DisturbanceModel:
+    """Return the model of coefficients whose absolute sum is bounded, channel by channel."""
+    box = bound.bounding_box()
+    if not bound.is_box or not np.array_equal(box.lower, -box.upper):
+        raise InputError("l1_ball needs a disturbance box that is symmetric about 0", path="disturbance_class")
+    ball = NormBall(p=1.0, radius=1.0, dimension=dictionary.functions)
+    return DisturbanceModel(
+        "l1_ball", ball, bound, grid, functions=dictionary.at(grid.disturbance_piece), scale=box.upper
+    )
+
+
+def _join_pieces(bound: ConvexSet, dictionary: Dictionary, grid: TimeGrid) -> DisturbanceModel:
+    """Return the model of a set that couples the values at different times: one block of the values on all pieces."""
+    if not dictionary.is_indicators:
+        raise InputError("a budget needs a dictionary of one function for each piece", path="dictionaries.disturbance")
+    values = dictionary.at(grid.disturbance_piece)
+    signals = bound.of_signals(values @ np.diff(grid.breakpoints))
+    return DisturbanceModel("piecewise_constant", signals, bound, grid, functions=values)
 
 
 def _find_held_components(

@@ -19,6 +19,7 @@ from sparserob_core.control.problem.phase import TIME
 from sparserob_core.control.problem.problem import OptimalControlProblem, ProblemFactory
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
+from sparserob_core.control.sets.budget import BudgetedBox
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.matrices.packed import OrPacked, Packed
@@ -378,6 +379,37 @@ class CostOptions(Sparse):
 
 
 @final
+class BudgetOptions(Sparse):
+    """A budget of a disturbance over time: ``int sum_i |w_i|^p dt <= size``."""
+
+    p: Literal[1, 2]
+    """1: the integral of the sum of the absolute values; 2: that of the square of the Euclidean norm."""
+
+    size: float = Field(gt=0.0, allow_inf_nan=False)
+    """The largest value of the integral over the horizon, in units of ``|w|^p`` times the unit of time."""
+
+
+@final
+class DisturbedOptions(SetOptions):
+    """The set of the values of a disturbance; with a ``budget`` a box that is symmetric about 0."""
+
+    budget: BudgetOptions | None = None
+    """Bound of an integral of the disturbance over the horizon, such as ``{p: 1, size: 0.5}``."""
+
+    def build(self, where: str, dimension: int) -> ConvexSet:
+        """Return the set; raises `InputError` that begins with the key."""
+        bound = super().build(where, dimension)
+        if self.budget is None:
+            return bound
+        if not isinstance(bound, Box):
+            raise InputError(path=where, expected="a box beside the budget, such as box: 0.1", got=f"a {bound.kind}")
+        try:
+            return BudgetedBox(bound.lower, bound.upper, self.budget.p, self.budget.size)
+        except InputError as error:
+            raise error.under(where) from None
+
+
+@final
 class DisturbanceOptions(Sparse):
     """A disturbance of a list of several."""
 
@@ -507,16 +539,17 @@ class ProblemKeys(ProblemFactory, Options):
 
     disturbance: (
         Annotated[
-            Annotated[SetOptions, Tag("set")] | Annotated[list[DisturbanceOptions], Tag("list")],
+            Annotated[DisturbedOptions, Tag("set")] | Annotated[list[DisturbanceOptions], Tag("list")],
             one_of(
                 "a set, such as {box: 0.1}, or a list of disturbances, such as [{set: {box: 0.1}, E: [[0], [1]]}]",
-                set=(Mapping, SetOptions),
+                set=(Mapping, DisturbedOptions),
                 list=LIST,
             ),
         ]
         | None
     ) = None
-    """Set of the values of the disturbance; none unless given. Or a list of disturbances, each with its set, its ``E``,
+    """Set of the values of the disturbance; none unless given. A ``budget`` beside a box bounds an integral over the
+    horizon, as in ``{box: 0.1, budget: {p: 1, size: 0.5}}``. Or a list of disturbances, each with its set, its ``E``,
     its class and its pieces, such as ``[{set: {box: 0.1}, E: [[0], [1]]}, {set: {box: 0.02}, E: [[1], [0]], pieces:
     8}]``."""
 

@@ -548,6 +548,8 @@ def checked_set(name: str, value: object, dimension: int, of: str, bounded: bool
         )
     if bounded and not value.is_bounded:
         raise InputError("the set must be bounded", path=name)
+    if not value.is_pointwise and name != "disturbance":
+        raise InputError(path=name, expected="a set without a budget, which is of a disturbance", got=value.kind)
     require_consistent(name, value)
     return value
 

@@ -19,6 +19,7 @@ from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.repeat import widths
 from sparserob_core.control.problem.terms.windows import MixedConstraint, UntilHorizon
 from sparserob_core.control.problem.tracing import trace_entries
+from sparserob_core.control.sets.budget import BudgetedBox
 from sparserob_core.control.sets.sets import Box, Equality, Product, SetFactory
 from sparserob_core.control.term import Term
 from sparserob_core.errors import InputError
@@ -92,6 +93,9 @@ def _write_disturbance(problem: OptimalControlProblem, system: dict[str, Any]) -
     A list takes the columns of ``E`` out of the keys of the ``system``.
     """
     bound = problem.disturbance
+    if isinstance(bound, BudgetedBox):
+        keys = set_keys("disturbance", Box(bound.lower, bound.upper))
+        return {**keys, "budget": {"p": bound.p, "size": float(bound.size)}}
     if not isinstance(bound, Product):
         assert bound is not None
         return set_keys("disturbance", bound)
