@@ -83,7 +83,7 @@ class Sources:
 
     @cached_property
     def changes(self) -> BoundedInput | None:
-        """What changes of the control that come late may deliver beside `means`: up to half of the change."""
+        """The input that changes of the control that come late may deliver beside `means`: up to half of the change."""
         if not self.problem.jitter:
             return None
         if self.timing.answering:

@@ -1,4 +1,4 @@
-"""How the delivered control may differ from the command: on which pieces, and by what part of which values."""
+"""The difference between the delivered control and the command: on which pieces, and by what part of which values."""
 
 from __future__ import annotations
 

@@ -267,6 +267,8 @@ class OptimalControlProblem(Term):
         self._check_uncertain()
         self._set_field("execution", self._check_execution())
         self._set_field("jitter", self._check_jitter())
+        if self.delivery is not None:
+            self._refuse_beside_delivery()
         sealed(self)
 
     @property
@@ -369,10 +371,7 @@ class OptimalControlProblem(Term):
         refuse_cases("fixed final state", {"general parameters and entries in t": is_fixed}, got="others")
 
     def _check_execution(self) -> Array | None:
-        """Return the errors of execution ``(m,)``, or ``None`` where there are none.
-
-        Raises `InputError` for combinations with other fields of which nothing can be proven yet.
-        """
+        """Return the errors of execution ``(m,)``, or ``None`` where there are none."""
         if self.execution is None:
             return None
         m = self.system.controls
@@ -381,16 +380,22 @@ class OptimalControlProblem(Term):
             raise InputError(
                 path="execution", expected=f"{m} numbers from 0 to 1, one per control", got=f"{shares.tolist()}"
             )
-        if not shares.any():
-            return None
-        refuse_cases("execution", self._list_deviation_cases(), got=f"{shares.tolist()}")
-        return shares
+        return shares if shares.any() else None
 
-    def _list_deviation_cases(self) -> dict[str, bool]:
-        """Return the combinations with deviations of the delivered control of which nothing can be proven yet."""
+    def _check_jitter(self) -> float:
+        """Return the jitter; raise `InputError` where it is no time within the horizon."""
+        jitter = as_bound("jitter", self.jitter)
+        if jitter.shape != (1,) or not (jitter[0] == 0.0 or SAME_TIME * self.horizon < jitter[0] < self.horizon):
+            expected = f"0, or a time below {self.horizon:g} (the horizon) and above rounding"
+            raise InputError(path="jitter", expected=expected, got=f"{self.jitter!r}")
+        return float(jitter[0])
+
+    def _refuse_beside_delivery(self) -> None:
+        """Raise `InputError` for combinations with errors of execution, or with changes that come late, of which
+        nothing can be proven."""
         sets = [entry if isinstance(entry, ConvexSet) else entry.set for entry in (*self.path, *self.terminal_sets)]
         timed = self._find_timed_system()
-        return {
+        cases = {
             "fixed final state": bool(self.terminal_equalities),
             "parameters in no box": timed is None,
             "measurable in a curved set": any(bound.halfspaces() is None for bound in filter(None, [self.measurable]))
@@ -399,28 +404,21 @@ class OptimalControlProblem(Term):
             and timed.powers is not None
             and any(bound.halfspaces() is None for bound in sets),
         }
-
-    def _check_jitter(self) -> float:
-        """Return the jitter; raise `InputError` where it is no time within the horizon, or for combinations with other
-        fields of which nothing can be proven."""
-        jitter = as_bound("jitter", self.jitter)
-        if jitter.shape != (1,) or not (jitter[0] == 0.0 or SAME_TIME * self.horizon < jitter[0] < self.horizon):
-            expected = f"0, or a time below {self.horizon:g} (the horizon) and above rounding"
-            raise InputError(path="jitter", expected=expected, got=f"{self.jitter!r}")
-        if jitter[0] > 0.0:
-            cases = {
-                "execution": self.execution is not None,
-                "delay": self.system.delay > 0.0,
-                "repeat": bool(self.repeat),
-                "mixed": any(isinstance(entry, MixedConstraint) for entry in self.windows),
-                "integral": any(np.any(entry.G) for entry in self.integral),
-            }
-            refuse_cases("jitter", {**cases, **self._list_deviation_cases()}, got=f"{jitter[0]:g}")
-        return float(jitter[0])
+        beside_jitter = {
+            "execution": self.execution is not None,
+            "delay": self.system.delay > 0.0,
+            "repeat": bool(self.repeat),
+            "mixed": any(isinstance(entry, MixedConstraint) for entry in self.windows),
+            "integral": any(np.any(entry.G) for entry in self.integral),
+        }
+        if self.jitter:
+            refuse_cases("jitter", {**beside_jitter, **cases}, got=f"{self.jitter:g}")
+        else:
+            refuse_cases("execution", cases, got=f"{np.asarray(self.execution).tolist()}")
 
     @property
     def delivery(self) -> Delivery | None:
-        """How the delivered control may differ from the command; ``None`` where it does not."""
+        """The way in which the delivered control may differ from the command; ``None`` where it does not."""
         if self.jitter:
             return Delivery(np.ones(self.system.controls), self.jitter)
         return None if self.execution is None else Delivery(np.asarray(self.execution))
