@@ -20,7 +20,7 @@ from sparserob_core.experiment.config.option_rows import option_rows
 from sparserob_core.experiment.config.run_config import RunConfig
 from sparserob_core.experiment.config.schema import config_schema
 from sparserob_core.experiment.plugins.commands import COMMANDS
-from sparserob_core.experiment.plugins.hookspecs import HOOKS, CommandPlugin
+from sparserob_core.experiment.plugins.hookspecs import HOOKS
 from sparserob_core.experiment.terminal.printing import EXIT
 from sparserob_core.options import meanings
 
@@ -163,7 +163,7 @@ def _config() -> list[str]:
 def _components() -> list[str]:
     lines = ["## Components"]
     for record in sr.load_registry().records():
-        if record.kind == CommandPlugin.kind:  # they have a section
+        if record.usage:  # commands have a section
             continue
         rows = [
             (f"`{row.name}`", row.type, row.default and f"`{row.default}`", row.range, row.meaning)

@@ -86,7 +86,8 @@ def components() -> Iterator[tuple[str, str]]:
     """A page for every component, and one for every kind."""
     when = YAML(typ="safe").load(WHEN.read_text(encoding="utf-8"))
     kinds = []
-    for kind, group in groupby(sr.load_registry().records(), key=lambda record: record.kind):
+    named = (record for record in sr.load_registry().records() if not record.usage)  # commands have their page
+    for kind, group in groupby(named, key=lambda record: record.kind):
         records, listed = list(group), []
         kinds.append(kind)
         for record in records:
