@@ -91,7 +91,9 @@ def _name_uncertainties(arrays: Mapping[str, Array], data: FigureData) -> str:
         "initial state": initial_state_varies,
     }
     words = [kind for kind, differs in kinds.items() if differs]
-    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]])) or "nothing is uncertain"
+    is_open = bool((data.tube_upper > data.tube_lower).any())  # then the control is not delivered as it is commanded
+    alone = "delivery of the control" if is_open else "nothing is uncertain"
+    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]])) or alone
 
 
 def draw_tube(ax: Axes, data: FigureData, component: int) -> None:

@@ -230,3 +230,32 @@ def test_the_figure_shows_every_state_and_every_disturbance(outcome):
     assert len(figure.axes) == 4
     labels = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
     assert {"worst case of path", "worst case of terminal"} <= labels
+
+
+@pytest.mark.parametrize(
+    ("more", "named"),
+    [
+        ({}, "nothing is uncertain"),
+        ({"jitter": 0.05}, "delivery of the control"),
+        ({"execution": 0.03}, "delivery of the control"),
+        ({"disturbance": {"box": [0.01, 0.01]}}, "disturbance"),
+    ],
+)
+def test_the_figure_names_what_makes_the_worst_cases(more, named):
+    problem = {
+        "name": "linear",
+        "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]]},
+        "horizon": 2.0,
+        "initial_state": [1.0, 0.0],
+        "control": {"box": 2.0},
+        "terminal": [{"box": [0.3, 0.3]}],
+        **more,
+    }
+    dictionary = {"control": {"name": "piecewise_constant", "pieces": 10}}
+    outcome = sr.run({"problem": problem, "dictionaries": dictionary, "observers": []}, quiet=True, figures=False)
+    arrays = adversaries(outcome.experiment, outcome.result.decision)
+    theta = np.asarray(outcome.result.decision).reshape(1, -1)
+    figure = draw_adversary(arrays, figure_data(outcome.experiment, theta, None, (), None))
+    assert f"the worst case of every constraint: {named}" in {
+        text.get_text() for text in figure.findobj(lambda part: hasattr(part, "get_text"))
+    }
