@@ -37,7 +37,7 @@ class Disturbances:
     def alike(self) -> bool:
         """True where all disturbances are of one class, and those on pieces are constant on the same pieces, any value
         of the set on each."""
-        is_coupled = self.problem.disturbance is not None and not self.problem.disturbance.is_pointwise
+        is_coupled = self.problem.has_budget
         return not self.several and self.held_components is None and not is_coupled
 
     def may_jump(self, time: float) -> np.ndarray:

@@ -23,7 +23,7 @@ def refuse_remaining(model: Transcription) -> None:
         "few functions of the disturbance": "l1_ball" in classes
         or (classes == {"piecewise_constant"} and not model.disturbance.is_complete),
         "two classes": len(classes) > 1,
-        "budget": problem.disturbance is not None and not problem.disturbance.is_pointwise,
+        "budget": problem.has_budget,
         "pieces of their own": problem.disturbance_breakpoints is not None,
         "integral": any(
             model.feedback is not None or np.any(entry.H) for entry in combine_states(model.stated).integral

@@ -417,6 +417,11 @@ class OptimalControlProblem(Term):
             refuse_cases("execution", cases, got=f"{np.asarray(self.execution).tolist()}")
 
     @property
+    def has_budget(self) -> bool:
+        """True where the values of the disturbance at different times share a budget."""
+        return self.disturbance is not None and not self.disturbance.is_pointwise
+
+    @property
     def delivery(self) -> Delivery | None:
         """The way in which the delivered control may differ from the command; ``None`` where it does not."""
         if self.jitter:

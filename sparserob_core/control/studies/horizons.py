@@ -90,7 +90,7 @@ def shorten_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalCo
             )
     if problem.disturbance_breakpoints is not None:
         raise refusal("horizon", "pieces of their own", got="breakpoints of their own")
-    if problem.disturbance is not None and not problem.disturbance.is_pointwise:
+    if problem.has_budget:
         raise refusal("horizon", "budget", got="a budget over the horizon")
     if problem.system.varies:
         raise refusal("horizon", "entries in t", got="one in t")

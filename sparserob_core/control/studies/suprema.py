@@ -187,7 +187,7 @@ def follow_row(
     system, d = problem.system, problem.system.states
     classes = problem.classes
     is_one_class = len(classes) <= 1 and problem.disturbance_breakpoints is None
-    is_one_class = is_one_class and (problem.disturbance is None or problem.disturbance.is_pointwise)
+    is_one_class = is_one_class and not problem.has_budget
     has_errors = problem.delivery is not None and theta.any()  # what stands still is delivered as it is commanded
     if not system.is_constant or system.parameter_count or not is_one_class or has_errors:
         return None

@@ -310,7 +310,7 @@ def refuse(
         "parameters": uncertain,
         "measurable": unsupported if "measurable" in classes else "",
         "l1_ball": unsupported,
-        "budget": problem.disturbance is not None and not problem.disturbance.is_pointwise,
+        "budget": problem.has_budget,
         "pieces of their own": problem.disturbance_breakpoints is not None,
         "flat uncertainty": " and the ".join(slanted),
         "fixed final state and flat uncertainty": " and the ".join(leaning),
