@@ -237,7 +237,7 @@ def test_a_witness_that_jumps_within_a_piece_of_its_own_is_refused(tmp_path):
     signal[0, 1] = 0.999 * signal[0, 0]
     told["witness"]["disturbance"] = signal.tolist()
     path.write_text(json.dumps(told))
-    assert "jumps at" in str(sr.check(tmp_path / "run").claims)
+    assert "jumps within a piece, at t = 0.333" in str(sr.check(tmp_path / "run").claims)
 
 
 LONG, STILL = [[0.3], [1]], {"set": {"box": 0.0}, "E": [[0.3], [1]]}
