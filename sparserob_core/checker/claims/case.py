@@ -243,7 +243,7 @@ class Case:
         early_inputs = (
             [stacked([[v] for v in balls([*before(self.problem)])])] if self.problem.system.delay > 0.0 else []
         )
-        inputs = [*early_inputs, *self.sources.means]
+        inputs = [*early_inputs, *self.sources.find_means(self.pieces)]
         if self.problem.system.drifts:
             inputs = [stacked([[v] for v in (*u.entries(), *balls([1.0]))]) for u in self.clock.each(inputs)]
         return Scene(

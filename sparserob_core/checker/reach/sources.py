@@ -63,19 +63,22 @@ class Sources:
         """Return `measurable_input` at one parameter."""
         return None if self.measurable_input is None else self.measurable_input.at(parameter)
 
-    @cached_property
-    def means(self) -> list[arb_mat]:
-        """The middle of what may be delivered, from each of the times `Timing.acting` on.
+    def find_means(self, pieces: Sequence[arb_mat]) -> list[arb_mat]:
+        """Return the middle of what may be delivered for ``pieces`` of the control, from each of the times
+        `Timing.acting` on.
 
         It is the value of a piece, and half of the old and half of the new value while a change may be late.
         """
-        return self._between_changes(lambda old, new: new if old is new else (old + new) / 2, lambda value: value)
+        mean = lambda old, new: new if old is new else (old + new) / 2  # noqa: E731
+        return self._between_changes(pieces, mean, lambda value: value)
 
     def _between_changes(
-        self, late: Callable[[arb_mat, arb_mat], arb_mat], settled: Callable[[arb_mat], arb_mat]
+        self,
+        pieces: Sequence[arb_mat],
+        late: Callable[[arb_mat, arb_mat], arb_mat],
+        settled: Callable[[arb_mat], arb_mat],
     ) -> list[arb_mat]:
         """Return one matrix for each interval in which a change may be late, and for each in which none is."""
-        pieces = self.pieces()
         if not self.problem.jitter:
             return [settled(value) for value in pieces]
         after = [matrix for old, new in pairwise(pieces) for matrix in (late(old, new), settled(new))]
@@ -83,14 +86,14 @@ class Sources:
 
     @cached_property
     def changes(self) -> BoundedInput | None:
-        """The input that changes of the control that come late may deliver beside `means`: up to half of the change."""
+        """The input that late changes of the control may deliver beside `find_means`: up to half of a change."""
         if not self.problem.jitter:
             return None
         if self.timing.answering:
             raise Unchecked("the checker knows changes that come late without feedback")
         m, breakpoints = self.problem.system.controls, np.array([*self.timing.acting, self.problem.horizon])
         none = stacked([[v] for v in balls(np.zeros(m))])
-        pieces = self._between_changes(lambda old, new: (new - old) / 2, lambda _: none)
+        pieces = self._between_changes(self.pieces(), lambda old, new: (new - old) / 2, lambda _: none)
         return self._build_bounded_input(SizedInput(np.ones(m), breakpoints, pieces, channels(m)))
 
     @cached_property

@@ -69,7 +69,7 @@ def test_a_row_has_the_mean_of_what_may_be_delivered(name: str) -> None:
         row = case.duality.row(C, time, [], ball(0.0))
         slope = np.array([[float(a) for a in entry] for entry in row.slope])
         value = float(row.constant) + float((slope * CONTROL.T).sum())
-        inputs = np.array([[float(x) for x in u.entries()] for u in case.sources.means]).T
+        inputs = np.array([[float(x) for x in u.entries()] for u in case.sources.find_means(case.pieces)]).T
     wanted = float(C @ expm(A * time) @ [-1.0, 0.3])
     for i, k in np.ndindex(2, 4):
         start, end = float(ENDS[k]), float(ENDS[k + 1])
