@@ -99,20 +99,24 @@ def in_units(record: R, units: Mapping[str, Unit], seal: Seal = np.asarray) -> R
     Returns
     -------
     dataclass
-        The record. Fields that share one array share one afterwards.
+        The record. Fields of one unit that share an array share one afterwards.
 
     Raises
     ------
     KeyError
         If a field has a unit without an entry.
     """
-    converted = dict[int, Any]()
+    converted = dict[tuple[int, str], Any]()
     changes = dict[str, Any]()
     kind: type = type(record)
     for name, described in quantities(kind).items():
-        if described.unit not in UNITLESS and not described.after:
-            value = getattr(record, name)
-            changes[name] = converted.setdefault(id(value), _scale(value, units[described.unit], seal))
+        if described.unit in UNITLESS or described.after:
+            continue
+        value = getattr(record, name)
+        key = id(value), described.unit
+        if key not in converted:
+            converted[key] = _scale(value, units[described.unit], seal)
+        changes[name] = converted[key]
     return replace(record, **changes)  # type: ignore[type-var]
 
 

@@ -122,3 +122,14 @@ def test_a_unit_that_nobody_knows_is_an_error() -> None:
 def test_fields_that_share_an_array_share_one_afterwards() -> None:
     lower = np.ones((1, 2))
     assert in_units(Sketch(lower, lower), {"index": 2.0}).points
+
+
+def test_fields_of_two_units_that_share_a_number_are_converted_each_by_its_own() -> None:
+    @dataclass(frozen=True)
+    class Shared:
+        cost: float = field(metadata=quantity("cost"))
+        height: float = field(metadata=quantity("row"))
+
+    number = 0.1 + 0.2
+    found = in_units(Shared(number, number), {"cost": 10.0, "row": 100.0})
+    assert (found.cost, found.height) == (10.0 * number, 100.0 * number)
