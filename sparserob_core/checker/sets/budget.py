@@ -45,11 +45,12 @@ class Budgeted(Shape):
 
     def support(self, direction: Sequence[arb]) -> arb:
         values = np.array([[float(c) for c in direction]])
-        multiplier = ball(self._choose_multipliers(np.abs(values))[0, 0])
+        multipliers = self._choose_multipliers(np.abs(values))
+        multiplier = ball(multipliers[0, 0])
         high = multiplier * ball(self.source.size)
         for c, r, h in zip(direction, balls(self.source.radii), balls(self.source.costs), strict=True):
             high = high + self._price(abs(c), multiplier * h, r)
-        point = [ball(x) for x in self._choose_points(values)[0]]
+        point = [ball(x) for x in self._choose_points(values, multipliers)[0]]
         while not self.holds(point):
             point = [INSIDE * x for x in point]
         low = total(c * x for c, x in zip(direction, point, strict=True))
@@ -71,7 +72,7 @@ class Budgeted(Shape):
         radii, costs, size = self.source.radii, self.source.costs, self.source.size
         multipliers = self._choose_multipliers(np.abs(value))
         low, high = (self._evaluate_prices(value + sign * spread, multipliers) for sign in (-1.0, 1.0))
-        points = self._choose_points(value)
+        points = self._choose_points(value, multipliers)
         with np.errstate(divide="ignore", invalid="ignore"):
             chord = np.where(spread > 0.0, (high - low) / (2.0 * spread), points)
         w = np.clip(np.where(np.isfinite(chord), chord, points), -radii, radii)
@@ -144,10 +145,10 @@ class Budgeted(Shape):
             low, high = np.where(spent > source.size, middle, low), np.where(spent > source.size, high, middle)
         return np.asarray(high)
 
-    def _choose_points(self, values: Array) -> Array:
-        """Return points ``(k, d)`` near the farthest ones: the response to the multiplier, filled up to the budget."""
+    def _choose_points(self, values: Array, multipliers: Array) -> Array:
+        """Return points ``(k, d)`` near the farthest ones: the response to the ``multipliers (k, 1)``, filled up to the
+        budget."""
         source, sizes = self.source, np.abs(values)
-        multipliers = self._choose_multipliers(sizes)
         point = self._respond(sizes, multipliers)
         if source.p == 1:
             open_cost = source.costs * np.where(sizes > 0.0, source.radii - point, 0.0)
@@ -172,7 +173,12 @@ def couple(bound: ConvexSet, lengths: Array, mid: Array, rad: Array) -> tuple[Co
         return bound, mid, rad
     mid, rad = (np.moveaxis(values, 0, -2) for values in (mid, rad))  # (..., w, blocks, b)
     mid, rad = (values.reshape(*values.shape[:-3], -1, values.shape[-1])[None] for values in (mid, rad))
-    return _join_signals(bound, lengths.tobytes()), mid, rad
+    return join_signals(bound, lengths), mid, rad
+
+
+def join_signals(bound: ConvexSet, lengths: Array) -> ConvexSet:
+    """Return the set of signals of a set that couples values, on pieces of such ``lengths (n,)``; it is made once."""
+    return _join_signals(bound, lengths.tobytes())
 
 
 @lru_cache(maxsize=256)

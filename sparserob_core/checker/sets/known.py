@@ -12,7 +12,7 @@ from flint import arb, ctx
 
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.sets.along import NormSummand
-from sparserob_core.checker.sets.budget import Budgeted
+from sparserob_core.checker.sets.budget import Budgeted, join_signals
 from sparserob_core.checker.sets.curved import Ball, Cylindrical, Ellipsoidal, Joint
 from sparserob_core.checker.sets.flat import Boxed, Octahedral, Polyhedral, Segments
 from sparserob_core.checker.sets.shape import Shape, total
@@ -76,11 +76,11 @@ def sum_supports(bound: ConvexSet, lengths: Array, weights: Sequence[Sequence[ar
     of such ``lengths``."""
     if bound.is_pointwise:
         return total(known(bound).support(row) for row in weights)
-    signals = bound.of_signals(lengths[: len(weights)])
+    signals = join_signals(bound, lengths[: len(weights)])
     return known(signals).support([row[i] for i in range(bound.dimension) for row in weights])
 
 
 def admit(bound: ConvexSet, lengths: Array, signal: Array) -> bool:
     """Return True where the values ``(mw, n)`` of a signal on pieces, each in the set, are shown to be a signal of it;
     raise `Unchecked` where rounding may have moved it out of the set."""
-    return bound.is_pointwise or known(bound.of_signals(lengths)).contains(signal.ravel())
+    return bound.is_pointwise or known(join_signals(bound, lengths)).contains(signal.ravel())
