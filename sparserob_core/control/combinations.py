@@ -57,6 +57,24 @@ class Refusal:
     pairs: tuple[str, ...] = ()
 
 
+def _list_delivery_cases(path: str) -> dict[str, Refusal]:
+    """Return the cases that are refused beside every deviation of the delivered control, at its key."""
+    return {
+        "fixed final state": Refusal(
+            "none beside fixed final values, which a deviation of the control misses: a terminal set such as box",
+            path,
+            ("fixed final state",),
+        ),
+        "parameters in no box": Refusal("none beside parameters in another set than a box", path),
+        "measurable in a curved set": Refusal(
+            "none beside measurable disturbances in a curved set where the system has pieces or parameters", path
+        ),
+        "curved path and general parameters": Refusal(
+            "none beside curved sets of states with parameters that the state does not depend on affinely", path
+        ),
+    }
+
+
 REFUSALS: dict[str, dict[str, Refusal]] = {
     "fixed final state": {
         "uncertainty": Refusal(
@@ -74,18 +92,7 @@ REFUSALS: dict[str, dict[str, Refusal]] = {
         ),
     },
     "execution": {
-        "fixed final state": Refusal(
-            "none beside fixed final values, which a deviation of the control misses: a terminal set such as box",
-            "execution",
-            ("fixed final state",),
-        ),
-        "parameters in no box": Refusal("none beside parameters in another set than a box", "execution"),
-        "measurable in a curved set": Refusal(
-            "none beside measurable disturbances in a curved set where the system has pieces or parameters", "execution"
-        ),
-        "curved path and general parameters": Refusal(
-            "none beside curved sets of states with parameters that the state does not depend on affinely", "execution"
-        ),
+        **_list_delivery_cases("execution"),
         "affine": Refusal(
             "none under feedback, where the size of the control, and with it that of its error, answers too",
             "execution",
@@ -108,18 +115,7 @@ REFUSALS: dict[str, dict[str, Refusal]] = {
             "jitter",
             ("integral",),
         ),
-        "fixed final state": Refusal(
-            "none beside fixed final values, which a deviation of the control misses: a terminal set such as box",
-            "jitter",
-            ("fixed final state",),
-        ),
-        "parameters in no box": Refusal("none beside parameters in another set than a box", "jitter"),
-        "measurable in a curved set": Refusal(
-            "none beside measurable disturbances in a curved set where the system has pieces or parameters", "jitter"
-        ),
-        "curved path and general parameters": Refusal(
-            "none beside curved sets of states with parameters that the state does not depend on affinely", "jitter"
-        ),
+        **_list_delivery_cases("jitter"),
         "affine": Refusal(
             "0 under feedback: a disturbance through the columns of B, as large as the steps of the control",
             "jitter",

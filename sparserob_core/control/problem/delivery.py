@@ -38,8 +38,9 @@ class Delivery:
             return control
         breakpoints, owner = late_breakpoints(control.breakpoints, self.jitter)
         after = np.flatnonzero(np.diff(owner, prepend=0))
-        values = control.sparse.tocsc()[:, owner].tolil()
-        values[:, after] = (control.sparse.tocsc()[:, owner[after] - 1] + control.sparse.tocsc()[:, owner[after]]) / 2.0
+        commanded = control.sparse.tocsc()
+        values = commanded[:, owner].tolil()
+        values[:, after] = (commanded[:, owner[after] - 1] + commanded[:, owner[after]]) / 2.0
         return Dictionary(breakpoints, values.tocsr())
 
     def scaling(self, mean: Dictionary) -> csr_array:

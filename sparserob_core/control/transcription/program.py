@@ -201,9 +201,7 @@ def compute_conversion_factors(theirs: Posed, own: Transcription, units: Units) 
     changes = np.repeat(ratios(steps.H, own_steps.divided(rows.steps).H, controls), steps.times.size)
     extra_units = own.acting.compute_extra_units(own, units)
     execution = own.functionals.execution
-    sizes = (
-        [] if execution is None else [np.repeat(controls, execution.size // controls.size)]
-    )  # bounded from both sides
+    sizes = [] if execution is None else [np.repeat(controls, execution.size // controls.size)]  # bounded on both sides
     decision = np.concatenate([np.repeat(controls, own.control.functions), *sizes, extra_units])
     image = np.concatenate([np.repeat(np.concatenate([controls, sides]), pieces), changes, *2 * sizes, extra_units])
     return decision, image, fixed(theirs.held)[0] @ units.states * rows.fixed
