@@ -13,9 +13,9 @@ import numpy as np
 from click.testing import CliRunner, Result
 
 from sparserob_core.errors import SparseRobError
+from sparserob_core.experiment.plugins.commands import MAX_STATUS, is_status
 from sparserob_core.testing.contract import Contract, demand
 
-MAX_STATUS = 255  # of a process
 HELP = ("-h", "--help")
 
 
@@ -78,7 +78,7 @@ class CommandContract(Contract[click.Command], kind="command"):
         demand(error is None, f"with the arguments {list(self.arguments)} it ends with: {error}", "name others")
         status = result.return_value
         demand(
-            status is None or (type(status) is int and 0 <= status <= MAX_STATUS),
+            is_status(status),
             f"it returns {status!r}",
             f"return a whole number from 0 to {MAX_STATUS}, or nothing",
         )

@@ -25,7 +25,7 @@ from sparserob_core.experiment.cli.shell.process import (
     open_streams,
     spare_imports,
 )
-from sparserob_core.experiment.plugins.commands import COMMANDS
+from sparserob_core.experiment.plugins.commands import COMMANDS, MAX_STATUS, is_status
 from sparserob_core.experiment.terminal.printing import own_output, printable
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 DEBUG = "SPARSEROB_DEBUG"
 # Allocations between two searches for cycles: at first nearly all are of modules, which stay.
 RARELY = (200_000, 20, 20)
-MAX_STATUS = 255  # of a process
 # errors of a command that have a message of their own
 PASSING = (SparseRobError, click.ClickException, click.exceptions.Exit, click.Abort, OSError, MemoryError)
 QUESTIONS = frozenset({"-h", "--help", "--version"})  # that need no numbers
@@ -148,7 +147,7 @@ def _list_foreign() -> tuple[dict[str, CommandPlugin], str]:
 
     registry = load_registry()
     records = (cast("CommandPlugin", record) for record in registry.records() if record.kind == "command")
-    return {name: r for r in records if (name := r.name.replace("_", "-")) not in COMMANDS}, registry.notes()
+    return {name: r for r in records if (name := r.typed) not in COMMANDS}, registry.notes()
 
 
 def _load_own(place: str) -> click.Command:
@@ -177,7 +176,7 @@ def _load_foreign(record: CommandPlugin) -> click.Command:
     def invoked(ctx: click.Context) -> int:
         with attributed(record.origin, "running it", PASSING):
             status = invoke(ctx)
-        if status is not None and (type(status) is not int or not 0 <= status <= MAX_STATUS):
+        if not is_status(status):
             expected = f"expected an exit status, 0 to {MAX_STATUS}, or nothing"
             raise PluginError(f"{record.origin}: running it returned {short_repr(status)}, {expected}")
         return status or 0

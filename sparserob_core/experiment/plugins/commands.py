@@ -1,4 +1,4 @@
-"""The commands of the core: where each one is, and its line in ``sparserob --help``.
+"""The commands of the core: where each one is, its line in ``sparserob --help``, and what any command may return.
 
 They are found here without any import, so that a command starts at once. `builtin` registers the same table.
 """
@@ -38,3 +38,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "examples": (f"{_CATALOGUE}.examples:examples", "List the experiments that come with SparseRob, or copy one."),
     "schema": (f"{_CATALOGUE}.schema:schema", "Print the JSON schema of a config."),
 }
+
+MAX_STATUS = 255  # of a process
+
+
+def is_status(value: object) -> bool:
+    """Return whether a command may return a value: an exit status, or nothing."""
+    return value is None or (type(value) is int and 0 <= value <= MAX_STATUS)

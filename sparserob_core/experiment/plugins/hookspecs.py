@@ -105,10 +105,15 @@ class CommandPlugin(Plugin, hook="sparserob_commands", component="click:Command"
     """
 
     @property
+    def typed(self) -> str:
+        """The name as users type it."""
+        return self.name.replace("_", "-")
+
+    @property
     def usage(self) -> str:
         """The help of the command."""
         command = self.create(Options())
-        return command.get_help(click.Context(command, info_name=f"sparserob {self.name.replace('_', '-')}"))
+        return command.get_help(click.Context(command, info_name=f"sparserob {self.typed}"))
 
     def create(self, options: Options) -> click.Command:
         """Return the command; it has arguments of its own and no ``options``."""

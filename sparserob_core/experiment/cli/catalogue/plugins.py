@@ -51,8 +51,8 @@ def _describe_component(registry: Registry, name: str) -> int:
     from sparserob_core.experiment.terminal.table import print_table
 
     for record in registry.find(name):
-        if record.usage:
-            say(record.usage)
+        if usage := record.usage:
+            say(usage)
             continue
         rows = [(row.name, row.type, row.default, row.range, row.meaning) for row in option_rows(record)]
         title = f"{record.kind} {record.name} (plugin {record.plugin}, {record.distribution}): {record.summary}"
