@@ -401,6 +401,8 @@ class RobustRows(Working):
             elastic = relaxing.solve(seconds=left(ledger.tools))
         self.calls += relaxing.answered
         self._record_calls(ledger)
+        if not elastic.solved:
+            ledger.tools.deadline.check()
         dual = self.refuted(elastic) if elastic.solved else None
         if dual is not None:
             return self._report_infeasible(ledger, elastic, dual)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.sip.inner.simplex.counterpart import Counterpart, RobustAnswer
 from sparserob_core.sip.limits import apart
 from sparserob_core.sip.limits.apart import call_apart
 from sparserob_core.sip.limits.deadline import LAST_STEP_SECONDS, LIMIT_GRACE_SECONDS, Deadline, OutOfTime
@@ -140,6 +141,31 @@ def test_every_long_step_of_a_run_ends_at_the_limit(
     found = sr.check(tmp_path / "run")
     assert not [claim for claim in found.claims if claim.verdict == "fails"]
     assert found.status == "verified" or status == "undecided"
+
+
+def test_a_limit_within_the_proof_of_infeasibility_says_undecided(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first program of a policy has no answer, and the one that would prove it runs out of time: nothing failed."""
+    solve = Counterpart.solve
+
+    def late(
+        counterpart: Counterpart, margin: float = 0.0, accuracy: float = 0.0, seconds: float = np.inf
+    ) -> RobustAnswer:
+        if not counterpart.elastic:
+            return solve(counterpart, margin, accuracy, seconds)
+        time.sleep(seconds)
+        none = np.zeros(0)
+        return RobustAnswer(False, "HiGHS: Time limit reached", none, none, np.zeros((0, 0)), none)
+
+    monkeypatch.setattr(Counterpart, "solve", late)
+    config = small() | {"policy": {"name": "affine"}}
+    config["problem"]["terminal"] = [{"box": [0.001, 0.001]}]
+    outcome = sr.run(config, {"limits.seconds": 1.0}, out=tmp_path / "run", quiet=True, figures=False)
+    assert outcome.status == "undecided"
+    assert outcome.result.message.startswith("the limit of 1 s is reached")
+    monkeypatch.undo()
+    assert sr.run(config, out=tmp_path / "proven", quiet=True, figures=False).status == "infeasible"
 
 
 @pytest.mark.parametrize("where", ["main", "thread"])
