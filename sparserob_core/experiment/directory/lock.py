@@ -1,4 +1,4 @@
-"""The lock of a directory, so that one run at a time writes into it: a file that names its owner."""
+"""The lock of a directory, so that one run at a time writes into it: a locked file that names its owner."""
 
 from __future__ import annotations
 
@@ -7,122 +7,76 @@ import os
 import platform
 from contextlib import suppress
 from pathlib import Path
-from typing import final
+from typing import TYPE_CHECKING, final
 
 from sparserob_core.errors import InputError
 
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
+
 NAME = ".lock"
-GUARD = ".lock.takeover"
-LOCK_ATTEMPTS = 3  # attempts to take a lock that others take and release at the same moment
+# Time in seconds in which a run that is just ending may release its lock. A tenth of it is less than two looks at the
+# lock; ten times as much would be waited for at every directory that somebody else writes into.
+RELEASE_SECONDS = 0.2
 
 
 @final
 class Lock:
-    """The lock of a directory: a file with the process number and the host of its owner.
+    """The lock of a directory: a file that the operating system locks, with the process and the host of its owner.
 
-    The file is created exclusively, so that only one of two processes gets the lock. A lock whose owner was killed on
-    this host is taken over.
+    The lock ends with its owner, however that ends. The file is removed while it is still locked; `filelock` does not
+    take a lock on a file that was removed.
     """
 
     def __init__(self, directory: Path) -> None:
         self.file = directory / NAME
+        self._held: BaseFileLock | None = None
 
     def acquire(self) -> None:
         """Take the lock; raises `InputError` where somebody else holds it, and `OSError` where nothing can be
         written."""
-        for _ in range(LOCK_ATTEMPTS):
-            try:
-                self.file.touch(exist_ok=False)
-            except FileExistsError:
-                if self._take_over():
-                    return
-            else:
-                self._write_owner()
-                return
-        raise self._make_error("")
+        from filelock import FileLock, Timeout
 
-    def _write_owner(self) -> None:
-        """Write the owner into a lock that was just created.
-
-        Where the disk is full, the lock is removed: a lock without an owner would exclude everybody.
-        """
+        lock = FileLock(self.file, timeout=RELEASE_SECONDS, thread_local=False)
         try:
-            self.file.write_text(_describe_process(), encoding="utf-8")
+            lock.acquire()
+        except Timeout:
+            raise InputError(
+                f"{self.file.parent}: another run is writing into it ({self._describe_owner()}); expected a new or an"
+                " empty directory"
+            ) from None
+        self._held = lock
+        try:
+            self.file.write_text(json.dumps({"process": os.getpid(), "host": platform.node()}), encoding="utf-8")
         except OSError:
-            self.file.unlink(missing_ok=True)
+            self.release()
             raise
 
     def release(self) -> None:
-        """Release the lock; nothing happens where it belongs to somebody else, or does not exist."""
-        with suppress(OSError):
-            if self._read_content() == _describe_process():
+        """Release the lock and remove its file; nothing happens where this object does not hold it."""
+        if self._held is not None:
+            with suppress(OSError):
                 self.file.unlink()
+            self._held.release()
+            self._held = None
 
-    def _take_over(self) -> bool:
-        """Return whether this process took over the lock of a process that is dead.
-
-        The result is false, and the lock may be free, where it has just vanished. Only the process that creates the
-        guard exclusively may replace the lock, and only after a second look at it. Two processes that find the same
-        dead owner therefore cannot both take the lock.
-        """
-        content = self._read_content()
-        if content is None:
-            return False
-        guard = self.file.with_name(GUARD)
-        if not _is_dead(content):
-            raise self._make_error(content)
+    def _describe_owner(self) -> str:
         try:
-            guard.touch(exist_ok=False)
-        except FileExistsError:
-            raise self._make_error(content) from None
-        try:
-            if self._read_content() != content:
-                return False
-            temporary = self.file.with_name(f"{NAME}.{os.getpid()}.tmp")
-            temporary.write_text(_describe_process(), encoding="utf-8")
-            temporary.replace(self.file)
-            return True
-        finally:
-            guard.unlink()
-
-    def _read_content(self) -> str | None:
-        try:
-            return self.file.read_text(encoding="utf-8", errors="replace")
-        except FileNotFoundError:
-            return None
-
-    def _make_error(self, found: str) -> InputError:
-        process, host = _parse_owner(found)
-        who = f"process {process} on {host}" if process else "whose number is not written yet"
-        return InputError(
-            f"{self.file.parent}: another run is writing into it ({who}); expected a new or an empty directory "
-            f"(delete {self.file} if that run is dead)"
-        )
+            owner = json.loads(self.file.read_text(encoding="utf-8"))
+            return f"process {owner['process']} on {owner['host']}"
+        except (OSError, ValueError, KeyError, TypeError):
+            return "whose number is not written yet"
 
 
-def owner_of(directory: Path) -> tuple[int, str]:
-    """Return the process that holds the lock of a directory and its host; 0 and an empty text where nobody does."""
+def is_free(directory: Path) -> bool:
+    """Return whether nobody holds the lock of a directory."""
+    lock = Lock(directory)
     try:
-        return _parse_owner((directory / NAME).read_text(encoding="utf-8", errors="replace"))
-    except OSError:
-        return 0, ""
-
-
-def _describe_process() -> str:
-    return json.dumps({"process": os.getpid(), "host": platform.node()})
-
-
-def _parse_owner(content: str) -> tuple[int, str]:
-    """Return the number of the process, 0 where it is not known, and the host."""
-    try:
-        data = json.loads(content)
-        return int(data["process"]), str(data["host"])
-    except (ValueError, KeyError, TypeError):
-        return 0, ""
-
-
-def _is_dead(content: str) -> bool:
-    return is_dead(*_parse_owner(content))
+        lock.acquire()
+    except (InputError, OSError):
+        return False
+    lock.release()
+    return True
 
 
 def is_dead(process: int, host: str) -> bool:

@@ -23,7 +23,7 @@ from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.config.plain import value_text
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory, finite, share_directory
 from sparserob_core.experiment.directory.finished import UNFINISHED, read_summary
-from sparserob_core.experiment.directory.lock import is_dead, owner_of
+from sparserob_core.experiment.directory.lock import is_dead, is_free
 from sparserob_core.experiment.directory.provenance import git_revision
 from sparserob_core.experiment.run.events import (
     Broadcast,
@@ -543,9 +543,10 @@ class _SweepCall:
         for name in _list_directories(self.directory / RUNS, hidden=True):
             path = self.directory / RUNS / name
             match = PARTIAL_OWNER.search(name)
-            # a run has no lock before its first file and after its last one: the process in its name is checked as well
-            owners = [owner_of(path), *([(int(match[2]), match[1])] if match else [])]
-            if all(not owner[0] or owner == (os.getpid(), platform.node()) or is_dead(*owner) for owner in owners):
+            owner = (int(match[2]), match[1]) if match else None
+            is_abandoned = owner is None or owner == (os.getpid(), platform.node()) or is_dead(*owner)
+            # a run has no lock before its first file and after its last one: so the process in its name is asked too
+            if is_abandoned and is_free(path):
                 shutil.rmtree(path, ignore_errors=True)
 
     def _report_progress(self, digest: str, open_ones: Mapping[Future[PointAnswer], str] | None = None) -> None:

@@ -10,6 +10,7 @@ import platform
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.cli.shell.process import hand_back_output, open_streams
 from sparserob_core.experiment.directory.artefacts import create_directory
-from sparserob_core.experiment.directory.lock import GUARD, NAME, Lock
+from sparserob_core.experiment.directory.lock import NAME, Lock, is_free
 from sparserob_core.experiment.terminal.printing import printable, say
 from tests.support.stub import Command
 
@@ -342,32 +343,55 @@ def test_the_lock_is_gone_when_a_run_is_over_whatever_its_end(config: Path, tmp_
     assert not [*tmp_path.glob("*/.*")]
 
 
-def test_the_lock_of_a_dead_process_is_taken_over_and_that_of_another_host_is_not(tmp_path: Path) -> None:
-    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
-    lock = {"process": int(dead.stdout), "host": platform.node()}
-    (tmp_path / NAME).write_text(json.dumps(lock))
-    with create_directory(tmp_path, "demo", "0123abcd"):
-        assert json.loads((tmp_path / NAME).read_text())["process"] == os.getpid()
-    assert not [*tmp_path.iterdir()]
-    for held in ({**lock, "host": "elsewhere"}, {**lock, "process": os.getppid()}):
-        (tmp_path / NAME).write_text(json.dumps(held))
-        with pytest.raises(sr.InputError, match="another run is writing into it"):
+def test_the_lock_of_a_process_that_was_killed_is_free_whatever_stands_in_its_file(tmp_path: Path) -> None:
+    hold = (
+        "import sys, time; from pathlib import Path; from sparserob_core.experiment.directory.lock import Lock\n"
+        "lock = Lock(Path(sys.argv[1])); lock.acquire(); print('held', flush=True); time.sleep(60.0)"
+    )
+    with subprocess.Popen([sys.executable, "-c", hold, str(tmp_path)], stdout=subprocess.PIPE) as owner:
+        assert owner.stdout is not None and owner.stdout.readline() == b"held\n"
+        with pytest.raises(sr.InputError, match=f"another run is writing into it .process {owner.pid} on "):
             create_directory(tmp_path, "demo", "0123abcd")
-        assert json.loads((tmp_path / NAME).read_text()) == held
-    (tmp_path / NAME).write_text("")
-    with pytest.raises(sr.InputError, match="whose number is not written yet"):
-        create_directory(tmp_path, "demo", "0123abcd")
+        assert not is_free(tmp_path)
+        (tmp_path / NAME).write_text("")
+        with pytest.raises(sr.InputError, match="whose number is not written yet"):
+            create_directory(tmp_path, "demo", "0123abcd")
+        owner.kill()
+    for left in ("", json.dumps({"process": os.getppid(), "host": "elsewhere"})):
+        (tmp_path / NAME).write_text(left)
+        with create_directory(tmp_path, "demo", "0123abcd"):
+            assert json.loads((tmp_path / NAME).read_text())["process"] == os.getpid()
+        assert not [*tmp_path.iterdir()]
 
 
-def test_of_two_that_find_a_dead_lock_only_one_takes_it_over(tmp_path: Path) -> None:
-    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
-    (tmp_path / NAME).write_text(json.dumps({"process": int(dead.stdout), "host": platform.node()}))
-    (tmp_path / GUARD).touch()
-    with pytest.raises(sr.InputError, match="another run is writing into it"):
-        Lock(tmp_path).acquire()
-    (tmp_path / GUARD).unlink()
-    Lock(tmp_path).acquire()
-    assert not (tmp_path / GUARD).exists()
+def test_a_lock_is_released_by_its_owner_alone_and_by_any_of_its_threads(tmp_path: Path) -> None:
+    held, stranger = Lock(tmp_path), Lock(tmp_path)
+    held.acquire()
+    stranger.release()
+    assert not is_free(tmp_path)
+    thread = threading.Thread(target=held.release)
+    thread.start()
+    thread.join()
+    assert is_free(tmp_path) and not (tmp_path / NAME).exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
+def test_a_child_that_outlives_its_parent_keeps_no_lock(tmp_path: Path) -> None:
+    program = (
+        "import os, signal, sys, time; from pathlib import Path\n"
+        "from sparserob_core.experiment.directory.lock import Lock\n"
+        "lock = Lock(Path(sys.argv[1])); lock.acquire(); child = os.fork()\n"
+        "if not child: time.sleep(60.0)\n"
+        "print(child, flush=True); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        parent.wait(10.0)
+        try:
+            assert is_free(tmp_path)
+        finally:
+            os.kill(child, signal.SIGKILL)
 
 
 def test_what_a_dead_run_has_left_is_not_written_over(tmp_path: Path) -> None:
