@@ -33,6 +33,9 @@ from sparserob_core.sip.inner.simplex.tangents import Tangents
 from sparserob_core.sip.solver import AccountedSolver, QuadraticProgram
 
 HIGHS_ACCURACY = 1e-10  # of rows and reduced costs: the least that HiGHS takes
+# Entries of the matrix below it are left out by HiGHS: the least that it takes. With a thousand times as much an answer
+# of hundreds of rows is off by 1e-7, and one program of noisy outputs took 96 s in place of 3 s.
+SMALLEST_ENTRY = 1e-12
 # Residuals of an answer of somebody else, in rows of length 1. Ten times more, and a row that was imposed is violated
 # by more than the margins by which rows are tightened (1e-8); ten times less, and it is more than was asked for.
 BELIEVED = 1e-9
@@ -55,6 +58,7 @@ INTERIOR_POINT_NUMBERS = 200_000
 # Steps from the last basis for each row and column of such a program, after which it is begun anew: that takes as long
 # as so many. With ten times as many one round took more than a minute; with a tenth of them small rounds begin anew.
 STEPS_PER_ROW_AND_COLUMN = 0.25
+UNSCALED = 0  # the strategy of HiGHS by which its simplex method does not scale
 ROBUST = "feedback"  # what these programs are called where a solver fails on some
 PERTURBED = 1e-4  # of slopes: what a perturbed cost may leave; a hundredth of it is seen, and 1e-2 is another entry's
 # Of least squares within bounds, at most: what is left of a slope after some lowers a bound, which holds
@@ -360,10 +364,15 @@ class Counterpart:
 
     def _read_multipliers(self, even: Array) -> tuple[Array, Array]:
         """Return the multipliers of all rows, and the deviations of exact ones, 0 for the others. The multipliers of
-        equations are those of one row at a deviation and of its opposite at none."""
+        equations are those of one row at a deviation and of its opposite at none. A multiplier that is negative, by
+        less than the tolerance of the solver, is one of the opposite row, if there is one."""
         y, deviations = [np.zeros(0)], [np.zeros((0, self.spread.size))]
         for block, (where, _, parts) in zip(self.blocks, self._imposed_rows, strict=True):
             multipliers, w = np.maximum(even[where], 0.0), np.zeros((block.h.size, self.spread.size))
+            for negative in np.flatnonzero(even[where] < 0.0).tolist() if parts else ():
+                opposite = _find_opposite(block, negative)
+                if opposite is not None:
+                    multipliers[opposite] -= even[where][negative]
             if not parts:
                 half = block.h.size // 2
                 table = even[where].reshape(half, -1)
@@ -599,6 +608,7 @@ class Growing:
             "threads": 1,
             "primal_feasibility_tolerance": HIGHS_ACCURACY,
             "dual_feasibility_tolerance": HIGHS_ACCURACY,
+            "small_matrix_value": SMALLEST_ENTRY,
         }.items():
             self.highs.setOptionValue(name, value)
 
@@ -673,7 +683,7 @@ class Growing:
         self.highs.setOptionValue("simplex_iteration_limit", int(patience * (self.columns + self.count)))
         steps = self._run_highs(inside=large and not has_basis)
         status, stalled = self.highs.getModelStatus(), highspy.HighsModelStatus
-        if status in (stalled.kUnknown, stalled.kIterationLimit, stalled.kSolveError):
+        if status in (stalled.kNotset, stalled.kUnknown, stalled.kIterationLimit, stalled.kSolveError):
             self.highs.clearSolver()  # this way led nowhere: once more from nothing, and not by the same
             self.highs.setOptionValue("simplex_iteration_limit", highspy.kHighsIInf)
             steps += self._run_highs(inside=large == has_basis)
@@ -685,16 +695,43 @@ class Growing:
         if status != highspy.HighsModelStatus.kOptimal:
             return False, message, np.zeros(0), np.zeros(0)
         solution = self.highs.getSolution()
+        if not (has_basis or large):
+            solution = self._correct_solution(solution)
         return True, message, np.array(solution.col_value), -np.array(solution.row_dual)
+
+    def _correct_solution(self, solution: Any) -> Any:
+        """Return the solution, or that without scaling where it is one of another matrix.
+
+        HiGHS scales rows and columns. Where entries of a row differ by many digits, its simplex method may end with
+        values of rows and reduced costs that are not those of the matrix, off by 1e-3 of the numbers.
+        """
+        import highspy
+
+        error = self._measure_error(solution)
+        if error <= BELIEVED:
+            return solution
+        self.highs.clearSolver()
+        self.highs.setOptionValue("simplex_scale_strategy", UNSCALED)
+        self.work += float(self._run_highs(inside=False)) * self.highs.getNumNz()
+        if self.highs.getModelStatus() != highspy.HighsModelStatus.kOptimal:
+            return solution
+        return min(solution, self.highs.getSolution(), key=self._measure_error)
+
+    def _measure_error(self, solution: Any) -> float:
+        """Return by how much values of rows differ from those of the matrix, or reduced costs in units of the largest
+        cost."""
+        program = self.highs.getLp()
+        matrix, cost = _read_matrix(program), np.array(program.col_cost_)
+        values = matrix @ np.array(solution.col_value) - np.array(solution.row_value)
+        costs = cost - matrix.T @ np.array(solution.row_dual) - np.array(solution.col_dual)
+        relative = np.abs(costs).max(initial=0.0) / np.abs(cost).max(initial=1.0)
+        return max(float(np.abs(values).max(initial=0.0)), float(relative))
 
     def _ask_solver(self, asked: AccountedSolver) -> tuple[bool, str, Array, Array] | str:
         """Return the answer of who is asked, from nothing, where it holds; in words why it does not."""
-        import highspy
-
         program = self.highs.getLp()
-        matrix, (low, high) = program.a_matrix_, (np.array(program.row_lower_), np.array(program.row_upper_))
-        kind = csc_array if matrix.format_ == highspy.MatrixFormat.kColwise else csr_array
-        table = kind((matrix.value_, matrix.index_, matrix.start_), shape=(self.count, self.columns)).tocsr()
+        low, high = np.array(program.row_lower_), np.array(program.row_upper_)
+        table = _read_matrix(program).tocsr()
         norms = np.sqrt(np.asarray(table.multiply(table).sum(axis=1)).reshape(-1))
         norms[norms == 0.0] = 1.0
         table = diags_array(1.0 / norms) @ table
@@ -744,6 +781,23 @@ class Growing:
                 self.highs.setOptionValue("solver", "choose")
         info = self.highs.getInfo()
         return int(1 + max(0, info.simplex_iteration_count) + INNER * max(0, info.ipm_iteration_count))
+
+
+def _find_opposite(block: UncertainRows, row: int) -> int | None:
+    """Return the row whose coefficients are those of another row with the other sign; ``None`` where there is none."""
+    candidates = np.flatnonzero((block.part == block.part[row]) & (block.factor == -block.factor[row]))
+    sums = block.g[candidates] + block.g[[row] * candidates.size]
+    opposites = candidates[np.abs(sums).max(axis=1).toarray().reshape(-1) == 0.0] if candidates.size else candidates
+    return int(opposites[0]) if opposites.size else None
+
+
+def _read_matrix(program: Any) -> csc_array | csr_array:
+    """Return the matrix of a program of HiGHS."""
+    import highspy
+
+    matrix = program.a_matrix_
+    kind = csc_array if matrix.format_ == highspy.MatrixFormat.kColwise else csr_array
+    return kind((matrix.value_, matrix.index_, matrix.start_), shape=(program.num_row_, program.num_col_))
 
 
 def weighted(weights: Array, table: csr_array) -> tuple[np.ndarray, Array]:
