@@ -428,37 +428,55 @@ class Counterpart:
         return (self._x > self.program.lower) & (self._x < self.program.upper)
 
     def _refine_multipliers(self, slope: Array, weights: Array, y: Array) -> None:
-        """Correct multipliers, such that less is left of slopes in the variables that answer nothing, and are between
-        their bounds.
+        """Correct multipliers, such that less is left of slopes in the variables that answer nothing.
 
-        ``slope (n,)`` and ``weights (n,)`` are those of the cost and of equalities. HiGHS perturbs costs by 1e-6, and
-        its last basis may be that of perturbed costs, or too inexact for other ones.
+        No slope is left in variables between their bounds, and none that draws others from where they are. ``slope
+        (n,)`` and ``weights (n,)`` are those of the cost and of equalities. HiGHS perturbs costs by 1e-6, and its last
+        basis may be that of perturbed costs, or too inexact for other ones.
         """
         sizes = self._find_adjustable_sizes(y)
         active = np.flatnonzero(sizes > 0.0)
         if not active.size:
             return
         rows = csr_array(vstack([block.g for block in self.blocks]))
-        answering = [C.indices for block in self.blocks for C in block.C]
-        is_inner = self._find_inner_variables() & ((weights == 0.0) | (self._x != 0.0))
-        is_inner[np.concatenate(answering)] = False
-        residual = slope + weights * np.sign(self._x) + y @ rows
+        balanced = self._balance_at_bounds(slope + y @ rows, weights)
+        residual = slope + y @ rows - balanced
+        answering = np.concatenate([C.indices for block in self.blocks for C in block.C])
         # of an answer that is no vertex, entries near a bound or near 0 have slopes of their own
-        is_inner &= np.abs(residual) <= PERTURBED * max(1.0, float(np.abs(slope).max(initial=0.0)))
-        columns = np.flatnonzero(is_inner)
+        is_corrected = np.abs(residual) <= PERTURBED * max(1.0, float(np.abs(slope).max(initial=0.0)))
+        is_corrected &= (residual != 0.0) | self._find_inner_variables()
+        is_corrected[answering] = False
+        columns = np.flatnonzero(is_corrected)
         if np.abs(residual[columns]).max(initial=0.0) <= HIGHS_ACCURACY:
             return
         shares = rows[active][:, columns].T.toarray() * sizes[active]
         change = sizes[active] * np.linalg.lstsq(shares, -residual[columns], rcond=SAME_POINT_DISTANCE)[0]
         y[active] = np.maximum(y[active] + change, 0.0)
-        linear = slope + weights * np.sign(self._x)
-        if np.abs(linear + y @ rows)[columns].max() > HIGHS_ACCURACY:
-            self._enter_tight_rows(slope, weights, rows, (sizes > 0.0), columns, y)
+        if np.abs(slope - balanced + y @ rows)[columns].max() > HIGHS_ACCURACY:
+            self._enter_tight_rows(slope, weights, balanced, rows, (sizes > 0.0), columns, y)
+
+    def _balance_at_bounds(self, slope: Array, weights: Array) -> Array:
+        """Return the part ``(n,)`` of a slope that the weights of absolute values and the bounds of the variables keep
+        in balance where these are."""
+        x, low, high = self._x, self.program.lower, self.program.upper
+        kept = np.where(x == 0.0, np.clip(slope, -weights, weights), -weights * np.sign(x))
+        beyond = slope - kept
+        return (
+            kept + np.where(x <= low, np.maximum(beyond, 0.0), 0.0) + np.where(x >= high, np.minimum(beyond, 0.0), 0.0)
+        )
 
     def _enter_tight_rows(
-        self, slope: Array, weights: Array, rows: csr_array, is_active: np.ndarray, columns: np.ndarray, y: Array
+        self,
+        slope: Array,
+        weights: Array,
+        balanced: Array,
+        rows: csr_array,
+        is_active: np.ndarray,
+        columns: np.ndarray,
+        y: Array,
     ) -> None:
-        """Correct multipliers, those of rows without one among them, such that less is left of slopes in ``columns``.
+        """Correct multipliers, those of rows without one among them, such that less is left of slopes in ``columns``
+        beside what is ``balanced (n,)``.
 
         Multipliers below the tolerance of a solver are 0 in its answer. Rows that hold with equality in the answer, and
         in which nothing deviates, may have one. A change is made only where it raises the bound.
@@ -466,11 +484,10 @@ class Counterpart:
         slack = np.concatenate([block.h for block in self.blocks]) - rows @ self._x
         is_tight = self._find_certain_rows() & (np.abs(slack) <= BELIEVED)
         candidates, changed = np.flatnonzero(is_active | is_tight), y.copy()
-        linear = slope + weights * np.sign(self._x)
         if candidates.size * columns.size > TIGHT_NUMBERS:
             return
         for _ in range(LEAST_SQUARES_PASSES):
-            residual = (linear + changed @ rows)[columns]
+            residual = (slope - balanced + changed @ rows)[columns]
             table = rows[candidates][:, columns].T.toarray()
             changed[candidates] += np.linalg.lstsq(table, -residual, rcond=SAME_POINT_DISTANCE)[0]
             is_negative = changed[candidates] < 0.0
