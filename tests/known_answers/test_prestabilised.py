@@ -16,7 +16,7 @@ from scipy.linalg import expm
 import sparserob_core as sr
 from sparserob_core.errors import InputError, SparseRobError
 from tests.known_answers.test_unstable import amplified, fixed_end, verdicts, wall
-from tests.support.amplified import drawn, exceeded
+from tests.support.amplified import drawn, drawn_far, exceeded
 from tests.support.oracle import bounds_of
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -147,6 +147,33 @@ def test_multipliers_that_a_solver_rounds_or_loses_cost_no_bound(number: int, tm
     assert outcome.status == "certified" and exceeded(problem, outcome) <= 1.0
     assert outcome.result.lower_bound >= outcome.result.upper_bound * (1.0 - 1e-8)
     assert set(verdicts(outcome).values()) == {"holds"}
+
+
+FAR = {2: "certified", 5: "certified", 8: "certified", 12: "certified", 38: "infeasible", 107: "certified"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", FAR)
+def test_plants_that_grow_by_up_to_e60_are_decided_on_an_inner_loop(number: int, tmp_path: Path) -> None:
+    problem = drawn_far(number)
+    problem.options["policy"] = {"name": "affine", "prestabilise": "auto", "causal_signals": 0}
+    outcome = run(problem.options, tmp_path / "run")
+    assert outcome.status == FAR[number]
+    assert outcome.status == "infeasible" or exceeded(problem, outcome) <= 1.0
+    assert set(verdicts(outcome).values()) == {"holds"}
+
+
+def test_the_nominal_control_of_an_inner_loop_is_compared_as_finely_as_its_set_is_wide(tmp_path: Path) -> None:
+    """It is a sum of parts that cancel, up to rounding that a piece of the control amplifies."""
+    problem = drawn_far(107)
+    problem.options["policy"] = {"name": "affine", "prestabilise": "auto", "causal_signals": 0}
+    outcome = run(problem.options, tmp_path / "run")
+    assert verdicts(outcome)["solution.npz"] == "holds"
+    with np.load(outcome.directory / "solution.npz") as stored:
+        arrays = dict(stored)
+    arrays["control"] = arrays["control"] + 1e-11 * 1.4 * (np.arange(10) == 9)
+    np.savez(outcome.directory / "solution.npz", **arrays)
+    assert verdicts(outcome)["solution.npz"] == "fails"
 
 
 @pytest.mark.slow

@@ -36,9 +36,17 @@ class Amplified:
 
 def drawn(number: int) -> Amplified:
     """Return the problem of a number: every third answers what it measures, every second ends in a fixed state."""
-    rng = np.random.default_rng([41, number])
-    d, pieces = int(rng.integers(1, 4)), int(rng.choice([10, 20, 40]))
-    exponent, horizon = float(rng.uniform(3.0, 40.0)), float(rng.uniform(1.0, 8.0))
+    return _draw(number, np.random.default_rng([41, number]), 3, (3.0, 40.0))
+
+
+def drawn_far(number: int) -> Amplified:
+    """Return a problem as `drawn` does, with up to 5 states, that grows by ``e^40`` to ``e^60``."""
+    return _draw(number, np.random.default_rng([43, number]), 5, (40.0, 60.0))
+
+
+def _draw(number: int, rng: np.random.Generator, states: int, exponents: tuple[float, float]) -> Amplified:
+    d, pieces = int(rng.integers(1, 1 + states)), int(rng.choice([10, 20, 40]))
+    exponent, horizon = float(rng.uniform(*exponents)), float(rng.uniform(1.0, 8.0))
     feedback, ends_fixed = number % 3 == 0, number % 2 == 0
     T = rng.normal(size=(d, d)) + 2.0 * np.eye(d)
     rates = np.concatenate([[exponent / horizon], rng.uniform(-3.0, 0.5, size=d - 1) * exponent / horizon / 3.0])

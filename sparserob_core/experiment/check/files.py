@@ -554,8 +554,9 @@ def _compare_solution(stored: StoredRun, case: Case) -> Verdicts:
         answered += ["observer"] if case.answering and case.problem.measurements is not None else []
         answered += ["prestabilise"] if case.inner.acts else []
         expected = _estimate_control(case)
-        if case.inner.acts:  # it is a sum in which both parts may cancel
-            size = np.broadcast_to(np.maximum(np.abs(decision), np.abs(expected)).max(axis=1)[:, None], size.shape)
+        if case.inner.acts:  # a sum whose parts may cancel: as accurate as controls are large
+            largest = case.problem.control.reach(np.eye(len(decision)))
+            size = np.maximum(np.maximum(np.abs(decision), np.abs(expected)), largest[:, None])
         agrees = (
             np.array_equal(theta, decision)
             and np.array_equal(flat[: decision.size], decision.ravel())

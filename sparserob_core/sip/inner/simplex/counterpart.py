@@ -700,10 +700,18 @@ class Growing:
         self.highs.setOptionValue("simplex_iteration_limit", int(patience * (self.columns + self.count)))
         steps = self._run_highs(inside=large and not has_basis)
         status, stalled = self.highs.getModelStatus(), highspy.HighsModelStatus
-        if status in (stalled.kNotset, stalled.kUnknown, stalled.kIterationLimit, stalled.kSolveError):
+        lost = (stalled.kNotset, stalled.kUnknown, stalled.kIterationLimit, stalled.kSolveError)
+        if status in lost:
             self.highs.clearSolver()  # this way led nowhere: once more from nothing, and not by the same
             self.highs.setOptionValue("simplex_iteration_limit", highspy.kHighsIInf)
             steps += self._run_highs(inside=large == has_basis)
+            status = self.highs.getModelStatus()
+        if status in lost:  # nor did this: as it was posed
+            self.highs.clearSolver()
+            self.highs.setOptionValue("simplex_scale_strategy", UNSCALED)
+            self.highs.setOptionValue("presolve", "off")
+            steps += self._run_highs(inside=False)
+            self.highs.setOptionValue("presolve", "choose")
             status = self.highs.getModelStatus()
         self.work = float(steps) * self.highs.getNumNz()
         message = f"HiGHS: {self.highs.modelStatusToString(status)}"
