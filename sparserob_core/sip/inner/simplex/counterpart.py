@@ -460,9 +460,9 @@ class Counterpart:
         in balance where these are."""
         x, low, high = self._x, self.program.lower, self.program.upper
         kept = np.where(x == 0.0, np.clip(slope, -weights, weights), -weights * np.sign(x))
-        beyond = slope - kept
+        excess = slope - kept
         return (
-            kept + np.where(x <= low, np.maximum(beyond, 0.0), 0.0) + np.where(x >= high, np.minimum(beyond, 0.0), 0.0)
+            kept + np.where(x <= low, np.maximum(excess, 0.0), 0.0) + np.where(x >= high, np.minimum(excess, 0.0), 0.0)
         )
 
     def _enter_tight_rows(
