@@ -38,21 +38,19 @@ def test_a_file_in_place_of_the_directory_is_refused(tmp_path: Path) -> None:
             create_directory(path, "demo", "0123abcd")
 
 
-@pytest.mark.parametrize("step", ["mkdir", "touch"])
+@pytest.mark.parametrize("step", ["pathlib.Path.mkdir", "filelock.FileLock.acquire", "pathlib.Path.write_text"])
 def test_a_directory_that_cannot_be_written_to_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
-    def refuse(path: Path, **options: object) -> None:
+    def refuse(*given: object, **options: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr(Path, step, refuse)
-    with pytest.raises(sr.InputError, match="out: cannot be written to: Permission denied"):
-        create_directory(tmp_path / "out" if step == "mkdir" else _made(tmp_path / "out"), "demo", "0123abcd")
-
-
-def _made(path: Path) -> Path:
-    path.mkdir()
-    return path
+    (tmp_path / "held").mkdir()
+    monkeypatch.setattr(step, refuse)
+    place = tmp_path / ("out" if step.endswith("mkdir") else "held")
+    with pytest.raises(sr.InputError, match=f"{place.name}: cannot be written to: Permission denied"):
+        create_directory(place, "demo", "0123abcd")
+    assert not [*(tmp_path / "held").iterdir()]
 
 
 def test_a_full_disk_leaves_the_old_file_and_no_half_of_the_new_one(
