@@ -22,7 +22,7 @@ from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.experiment.check.check import check
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import Spread
-from sparserob_core.sip.inner.simplex.counterpart import Growing
+from sparserob_core.sip.inner.simplex.growing import GrowingProgram
 from tests.support.problems import double_integrator
 
 RATE, T = 0.4, 3.0
@@ -217,15 +217,15 @@ def test_a_search_that_is_ended_leaves_an_honest_gap(
     pressed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After three rounds, or by a key within the sixth program; the cost is then that of `peak`, where it begins."""
-    calls, solve = [0], Growing.solve
+    calls, solve = [0], GrowingProgram.solve
 
-    def interrupted(self: Growing, seconds: float = np.inf) -> Any:
+    def interrupted(self: GrowingProgram, seconds: float = np.inf) -> Any:
         calls[0] += 1
         if pressed and calls[0] == 6:
             raise KeyboardInterrupt
         return solve(self, seconds)
 
-    monkeypatch.setattr(Growing, "solve", interrupted)
+    monkeypatch.setattr(GrowingProgram, "solve", interrupted)
     problem, method = {**DOUBLE, "disturbance": {"box": 0.1}}, {"name": "exchange", "rounds": 3}
     outcome = run(problem, 20, tmp_path / "run", **({} if pressed else {"method": method}))
     assert outcome.status == "verified", outcome.result.message

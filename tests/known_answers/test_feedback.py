@@ -415,16 +415,16 @@ def test_no_causal_policy_costs_less_than_a_tree_of_signals_proves(tmp_path: Pat
 def test_the_bound_against_causal_policies_depends_on_no_clock_and_says_so_where_it_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sparserob_core.sip.inner.simplex.counterpart import Growing
+    from sparserob_core.sip.inner.simplex.growing import GrowingProgram
 
     quick = run(springs(0.2, 0.5), 10, tmp_path / "quick").summary
-    solve = Growing.solve
+    solve = GrowingProgram.solve
 
-    def slowly(self: Growing, seconds: float = np.inf) -> Any:
+    def slowly(self: GrowingProgram, seconds: float = np.inf) -> Any:
         time.sleep(0.02)
         return solve(self, seconds)
 
-    monkeypatch.setattr(Growing, "solve", slowly)
+    monkeypatch.setattr(GrowingProgram, "solve", slowly)
     slow = run(springs(0.2, 0.5), 10, tmp_path / "slow").summary
     assert slow["causal_lower_bound"] == quick["causal_lower_bound"]
     stopped = run(springs(0.2, 0.5), 10, tmp_path / "stopped", policy={"causal_seconds": 0.0}).summary

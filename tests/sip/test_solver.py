@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import linprog
 
 import sparserob_core as sr
-from sparserob_core.sip.inner.simplex.counterpart import Growing
+from sparserob_core.sip.inner.simplex.growing import GrowingProgram
 from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.sip.solver import AccountedSolver, Auto, Failures, Named, Unanswered
 from sparserob_core.testing.solvers import regularised, robust_terminal
@@ -185,7 +185,7 @@ def test_reasons_that_differ_in_numbers_alone_are_one_and_what_is_new_can_be_tol
 
 
 def test_a_growing_program_forgets_the_limit_of_the_call_before():
-    rng, growing, n = np.random.default_rng(0), Growing(), 40
+    rng, growing, n = np.random.default_rng(0), GrowingProgram(), 40
     growing.variables(np.full(n, -2.0), np.full(n, 2.0), rng.normal(size=n))
     table = rng.normal(size=(60, n))
     row, column = np.nonzero(table)
@@ -206,7 +206,7 @@ def test_a_growing_program_has_the_same_answer_by_whoever_is_asked(seed):
     asked = AccountedSolver.of(Named(PIQP, "mine", AUTO))
     answers = []
     for who in (None, asked):
-        growing = Growing(who)
+        growing = GrowingProgram(who)
         growing.variables(np.full(n, -2.0), np.full(n, 2.0), cost)
         row, column = np.nonzero(table)
         growing.rows([(row, column, table[row, column])], low, high)

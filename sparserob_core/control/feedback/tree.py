@@ -25,7 +25,7 @@ import numpy as np
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.control.feedback.knowledge import Knowledge, sums
 from sparserob_core.sip.convex_set import Array, ConvexSet
-from sparserob_core.sip.inner.simplex.counterpart import Growing
+from sparserob_core.sip.inner.simplex.growing import GrowingProgram
 
 EXCEEDED = 1e-9  # of a row's size, beyond which it is imposed
 AT_ONCE = 3  # rows of every side that are imposed of each signal at once
@@ -128,7 +128,7 @@ class Tree:
         self._lower_bounds, self._upper_bounds = low / self._control_units, high / self._control_units
         largest = float((self.prices * self._control_units[:, None]).sum())
         self._cost_unit = largest if largest > 0.0 else 1.0
-        self._program = Growing()
+        self._program = GrowingProgram()
         upper, price = (0.0, 0.0) if self.highest is None else (self.highest, -1.0)
         self._program.variables(np.zeros(1), np.array([upper]), np.array([price]))
         self._size_columns = np.zeros((m, 0), dtype=int)

@@ -21,7 +21,7 @@ from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.inner.duality import dual_bound
-from sparserob_core.sip.inner.simplex.counterpart import Growing
+from sparserob_core.sip.inner.simplex.growing import GrowingProgram
 from sparserob_core.sip.program import TOLERANCE
 
 PARTS, LEVELS = 32, 3  # a cell that is open is cut in so many parts, so many times
@@ -187,7 +187,7 @@ class Tracking:
     def _start_program(self) -> None:
         """Begin with a program without rows, whose columns are the positive and the negative parts of the control."""
         weights, low, high = self.limits
-        self._program = Growing()
+        self._program = GrowingProgram()
         for reach in (high, -low):
             self._program.variables(np.zeros(reach.size), np.maximum(reach, 0.0), weights)
         self._row_instants: list[tuple[int, int, int, int]] = []  # row, piece, level and number of an instant

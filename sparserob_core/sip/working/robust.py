@@ -18,7 +18,8 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut, Dual, InfeasibleSubsystem
 from sparserob_core.sip.finite import FiniteSolution
-from sparserob_core.sip.inner.simplex.counterpart import Counterpart, RobustAnswer, robust_bound
+from sparserob_core.sip.inner.simplex.counterpart import Counterpart, RobustAnswer
+from sparserob_core.sip.inner.simplex.robust_bound import robust_bound
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, WorstConstraint
 from sparserob_core.sip.proof.verdict import MAX_NAMED_REASONS, add_facts

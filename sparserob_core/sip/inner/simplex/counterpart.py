@@ -17,60 +17,33 @@ from __future__ import annotations
 import time
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import numpy as np
 from scipy.optimize import lsq_linear
-from scipy.sparse import csc_array, csr_array, diags_array, vstack
+from scipy.sparse import csr_array, vstack
 
-from sparserob_core.errors import PluginError, named
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.finite import HIGHS, FiniteProgram, Spread, UncertainRows, entries_of, gathered
-from sparserob_core.sip.inner.duality import Terms, add_pairwise, bound_rounding, replace_norms, tangent_terms
-from sparserob_core.sip.inner.simplex.interruptible import run
-from sparserob_core.sip.inner.simplex.silence import silent
+from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows, entries_of
+from sparserob_core.sip.inner.simplex.growing import BELIEVED, HIGHS_ACCURACY, GrowingProgram
+from sparserob_core.sip.inner.simplex.robust_bound import weighted
 from sparserob_core.sip.inner.simplex.tangents import Tangents
-from sparserob_core.sip.solver import AccountedSolver, QuadraticProgram
+from sparserob_core.sip.solver import AccountedSolver
 
-HIGHS_ACCURACY = 1e-10  # of rows and reduced costs: the least that HiGHS takes
-# Entries of the matrix below it are left out by HiGHS: the least that it takes. With a thousand times as much an answer
-# of hundreds of rows is off by 1e-7, and one program of noisy outputs took 96 s in place of 3 s.
-SMALLEST_ENTRY = 1e-12
-# Residuals of an answer of somebody else, in rows of length 1. Ten times more, and a row that was imposed is violated
-# by more than the margins by which rows are tightened (1e-8); ten times less, and it is more than was asked for.
-BELIEVED = 1e-9
-# An answer that misses more is not asked for with fewer digits: a first-order method needs seconds for each, and does
-# not mend what is off by so much. With a hundredth, answers that a second time mends are given up.
-HOPELESS_RESIDUAL = 1e-4
 # Of what is added up to the cost: by how much its tangents may be below it. HiGHS meets rows to 1e-10, and there is one
 # tangent of every term, so that ten times less may not be reached; ten times more is a tenth of a gap that is asked for
 # at 1e-8.
 TANGENT_SHORTFALL = 1e-9
 TOUCHED = 60  # rounds of tangents: each quarters what squares are below, 30 leave 1e-18 of it
-# Steps from the last basis for each row and column, after which there is no end to them: a program of 918 columns and
-# 1 835 rows went in circles from there, and took 1 188 steps from nothing. With a tenth of it programs that come to an
-# end are begun anew; with ten times as many a small one takes half a minute.
-STALLED = 10
-# Numbers in the rows, from which on a program without a basis is solved by the interior point method of HiGHS, which
-# ends at one too. With half of them both take as long; with 480 000, of a policy that answers one noisy output on 40
-# pieces, the simplex method took 35 000 steps to the optimum and went in circles from there, where this takes 9 s.
-INTERIOR_POINT_NUMBERS = 200_000
-# Steps from the last basis for each row and column of such a program, after which it is begun anew: that takes as long
-# as so many. With ten times as many one round took more than a minute; with a tenth of them small rounds begin anew.
-STEPS_PER_ROW_AND_COLUMN = 0.25
-UNSCALED = 0  # the strategy of HiGHS by which its simplex method does not scale
-ROBUST = "feedback"  # what these programs are called where a solver fails on some
 PERTURBED = 1e-4  # of slopes: what a perturbed cost may leave; a hundredth of it is seen, and 1e-2 is another entry's
 # Of least squares within bounds, at most: what is left of a slope after some lowers a bound, which holds
 LEAST_SQUARES_PASSES = 20
 # Numbers in the table of rows that may get a multiplier; larger ones are left as they are. Ten times as many take
 # seconds in each round, and with a tenth plans of 100 pieces keep slopes.
 TIGHT_NUMBERS = 250_000
-INNER = 20  # steps of the simplex method that one of an interior point method takes as long as
 SAME_POINT_DISTANCE = 1e-12  # points of a set that are closer are one
-DRAWN = (
-    2.0**-41
-)  # by which deviations of sets that are no boxes are drawn inwards, so that they are shown to be in them
+# Share by which deviations of sets that are no boxes are drawn inwards, so that they are shown to be in them
+DRAWN = 2.0**-41
 
 
 @final
@@ -137,7 +110,7 @@ class Counterpart:
     _margin: float = 0.0
 
     def __post_init__(self) -> None:
-        self._linear, self._x = Growing(self.asked), np.zeros(self.program.n)
+        self._linear, self._x = GrowingProgram(self.asked), np.zeros(self.program.n)
         program, n = self.program, self.program.n
         low, high = program.lower, program.upper
         priced = not (self.elastic or self.scales)
@@ -605,209 +578,6 @@ class Counterpart:
         return float(slope[is_sloped] @ bounds[is_sloped])
 
 
-@final
-class Growing:
-    """A sparse linear program that grows, solved by HiGHS from where it was, unless somebody else is ``asked``; ``by``:
-    whose the last answer was."""
-
-    def __init__(self, asked: AccountedSolver | None = None) -> None:
-        import highspy
-
-        self.asked, self.by = asked, HIGHS
-        with silent():
-            self.highs: Any = highspy.Highs()
-        self.columns = self.count = 0
-        self.refused = False
-        self._entering_pairs = list[tuple[np.ndarray, np.ndarray]]()
-        self.work = 0.0  # of the last solution: entries times steps
-        for name, value in {
-            "output_flag": False,
-            "threads": 1,
-            "primal_feasibility_tolerance": HIGHS_ACCURACY,
-            "dual_feasibility_tolerance": HIGHS_ACCURACY,
-            "small_matrix_value": SMALLEST_ENTRY,
-        }.items():
-            self.highs.setOptionValue(name, value)
-
-    def variables(self, lower: Array, upper: Array, cost: Array) -> np.ndarray:
-        """Add columns with these bounds and costs, and return their numbers."""
-        none = np.zeros(0, dtype=np.int32)
-        starts = np.zeros(lower.size, dtype=np.int32)
-        self.highs.addCols(lower.size, cost, lower, upper, 0, starts, none, np.zeros(0))
-        self.columns += lower.size
-        return np.arange(self.columns - lower.size, self.columns)
-
-    def rows(self, entries: list[tuple[np.ndarray, np.ndarray, Array]], lower: Array, upper: Array) -> np.ndarray:
-        """Add rows, and return their numbers; ``entries`` are rows counted from 0, columns and values."""
-        import highspy
-
-        row, column, value = (np.concatenate(arrays) for arrays in zip(*entries, strict=True))
-        starts, places, values = gathered(row, column, value, (upper.size, self.columns))
-        status = self.highs.addRows(upper.size, lower, upper, values.size, starts[:-1], places, values)
-        self.refused |= status == highspy.HighsStatus.kError  # an entry that is too large
-        self.count += upper.size
-        return np.arange(self.count - upper.size, self.count)
-
-    def enter(self, columns: np.ndarray, rows: np.ndarray) -> None:
-        """Begin with ``columns``, which cost nothing, in the basis in place of as many ``rows``, equations that were
-        added since: no reduced cost changes, and no step is needed for each of them."""
-        self._entering_pairs.append((columns, rows))
-
-    def _extend_basis(self) -> None:
-        """Put what is to enter into the last basis."""
-        import highspy
-
-        if not self._entering_pairs:
-            return
-        columns, rows = (np.concatenate(arrays).tolist() for arrays in zip(*self._entering_pairs, strict=True))
-        self._entering_pairs, status = [], highspy.HighsBasisStatus
-        basis = self.highs.getBasis()
-        if not basis.valid:  # the first solution: presolve takes out these equations, and begins in a better place
-            return
-        within, without = basis.col_status, basis.row_status
-        for column, row in zip(columns, rows, strict=True):
-            if without[row] == status.kBasic and within[column] != status.kBasic:
-                within[column], without[row] = status.kBasic, status.kLower
-        basis.col_status, basis.row_status = within, without
-        self.highs.setBasis(basis)
-
-    def limit(self, rows: np.ndarray, upper: Array) -> None:
-        """Set new upper limits of rows that have no lower limit."""
-        for row, value in zip(rows.tolist(), upper.tolist(), strict=True):
-            self.highs.changeRowBounds(row, -np.inf, value)
-
-    def solve(self, seconds: float = np.inf) -> tuple[bool, str, Array, Array]:
-        """Solve the program within ``seconds``.
-
-        Returns whether it was solved, the solver's words, the values of the columns and the multipliers of the rows. It
-        is not solved where the time does not suffice.
-        """
-        import highspy
-
-        if self.refused:
-            return False, "HiGHS: a row is refused", np.zeros(0), np.zeros(0)
-        reason, self.by = "", HIGHS
-        if self.asked is not None:
-            answer = self._ask_solver(self.asked)
-            if not isinstance(answer, str):
-                self.by = self.asked.name
-                return answer
-            reason = answer
-        self._extend_basis()
-        self.highs.setOptionValue("time_limit", self.highs.getRunTime() + max(seconds, 0.0))  # none of an earlier call
-        has_basis, large = bool(self.highs.getBasis().valid), self.highs.getNumNz() >= INTERIOR_POINT_NUMBERS
-        patience = STEPS_PER_ROW_AND_COLUMN if has_basis and large else STALLED
-        self.highs.setOptionValue("simplex_iteration_limit", int(patience * (self.columns + self.count)))
-        steps = self._run_highs(inside=large and not has_basis)
-        status, stalled = self.highs.getModelStatus(), highspy.HighsModelStatus
-        lost = (stalled.kNotset, stalled.kUnknown, stalled.kIterationLimit, stalled.kSolveError)
-        if status in lost:
-            self.highs.clearSolver()  # this way led nowhere: once more from nothing, and not by the same
-            self.highs.setOptionValue("simplex_iteration_limit", highspy.kHighsIInf)
-            steps += self._run_highs(inside=large == has_basis)
-            status = self.highs.getModelStatus()
-        if status in lost:  # nor did this: as it was posed
-            self.highs.clearSolver()
-            self.highs.setOptionValue("simplex_scale_strategy", UNSCALED)
-            self.highs.setOptionValue("presolve", "off")
-            steps += self._run_highs(inside=False)
-            self.highs.setOptionValue("presolve", "choose")
-            status = self.highs.getModelStatus()
-        self.work = float(steps) * self.highs.getNumNz()
-        message = f"HiGHS: {self.highs.modelStatusToString(status)}"
-        if self.asked is not None and status in (stalled.kOptimal, stalled.kInfeasible):
-            self.asked.failures.add(ROBUST, reason, HIGHS)
-        if status != highspy.HighsModelStatus.kOptimal:
-            return False, message, np.zeros(0), np.zeros(0)
-        solution = self.highs.getSolution()
-        if not (has_basis or large):
-            solution = self._correct_solution(solution)
-        return True, message, np.array(solution.col_value), -np.array(solution.row_dual)
-
-    def _correct_solution(self, solution: Any) -> Any:
-        """Return the solution, or that without scaling where it is one of another matrix.
-
-        HiGHS scales rows and columns. Where entries of a row differ by many digits, its simplex method may end with
-        values of rows and reduced costs that are not those of the matrix, off by 1e-3 of the numbers.
-        """
-        import highspy
-
-        error = self._measure_error(solution)
-        if error <= BELIEVED:
-            return solution
-        self.highs.clearSolver()
-        self.highs.setOptionValue("simplex_scale_strategy", UNSCALED)
-        self.work += float(self._run_highs(inside=False)) * self.highs.getNumNz()
-        if self.highs.getModelStatus() != highspy.HighsModelStatus.kOptimal:
-            return solution
-        return min(solution, self.highs.getSolution(), key=self._measure_error)
-
-    def _measure_error(self, solution: Any) -> float:
-        """Return by how much values of rows differ from those of the matrix, or reduced costs in units of the largest
-        cost."""
-        program = self.highs.getLp()
-        matrix, cost = _read_matrix(program), np.array(program.col_cost_)
-        values = matrix @ np.array(solution.col_value) - np.array(solution.row_value)
-        costs = cost - matrix.T @ np.array(solution.row_dual) - np.array(solution.col_dual)
-        relative = np.abs(costs).max(initial=0.0) / np.abs(cost).max(initial=1.0)
-        return max(float(np.abs(values).max(initial=0.0)), float(relative))
-
-    def _ask_solver(self, asked: AccountedSolver) -> tuple[bool, str, Array, Array] | str:
-        """Return the answer of who is asked, from nothing, where it holds; in words why it does not."""
-        program = self.highs.getLp()
-        low, high = np.array(program.row_lower_), np.array(program.row_upper_)
-        table = _read_matrix(program).tocsr()
-        norms = np.sqrt(np.asarray(table.multiply(table).sum(axis=1)).reshape(-1))
-        norms[norms == 0.0] = 1.0
-        table = diags_array(1.0 / norms) @ table
-        cost = np.array(program.col_cost_)
-        kappa = float(np.abs(cost).max(initial=0.0)) or 1.0
-        equal = low == high
-        above, below = np.flatnonzero(np.isfinite(high) & ~equal), np.flatnonzero(np.isfinite(low) & ~equal)
-        fixed = np.flatnonzero(equal)
-        posed = QuadraticProgram(
-            csc_array((self.columns, self.columns)),
-            cost / kappa,
-            csc_array(vstack([table[above], -table[below]])),
-            np.concatenate([(high / norms)[above], -(low / norms)[below]]),
-            csc_array(table[fixed]),
-            (high / norms)[fixed],
-            np.array(program.col_lower_),
-            np.array(program.col_upper_),
-        )
-        message = ""
-        for accuracy in (HIGHS_ACCURACY, BELIEVED):  # the last digit that is asked for may cost the others
-            try:
-                claim = asked.solve(posed, accuracy)
-            except Exception as error:  # noqa: BLE001  a foreign solver may raise anything; its failure must not be ours
-                return str(error) if isinstance(error, PluginError) else f"the solver raised {named(error)}"
-            if claim.met(posed, BELIEVED):
-                break
-            if not claim.met(posed, HOPELESS_RESIDUAL):
-                return claim.message
-            note = "; its rows, bounds, slopes or gap are missed by more than 1e-9"
-            message = message or f"{claim.message}{note if claim.status == 'solved' else ''}"
-        else:
-            return message
-        multipliers = np.zeros(self.count)
-        multipliers[above] += claim.z[: above.size]
-        multipliers[below] -= claim.z[above.size :]
-        multipliers[fixed] = claim.y
-        return True, claim.message, np.clip(claim.x, posed.lower, posed.upper), kappa * multipliers / norms
-
-    def _run_highs(self, inside: bool) -> int:
-        """Solve it, by an interior point method where it is to be sought from ``inside``; the steps that this took."""
-        if inside:
-            self.highs.setOptionValue("solver", "ipm")
-        try:
-            run(self.highs)
-        finally:
-            if inside:
-                self.highs.setOptionValue("solver", "choose")
-        info = self.highs.getInfo()
-        return int(1 + max(0, info.simplex_iteration_count) + INNER * max(0, info.ipm_iteration_count))
-
-
 def _find_opposite(block: UncertainRows, row: int) -> int | None:
     """Return the row whose coefficients are those of another row with the other sign; ``None`` where there is none."""
     candidates = np.flatnonzero((block.part == block.part[row]) & (block.factor == -block.factor[row]))
@@ -816,102 +586,6 @@ def _find_opposite(block: UncertainRows, row: int) -> int | None:
     return int(opposites[0]) if opposites.size else None
 
 
-def _read_matrix(program: Any) -> csc_array | csr_array:
-    """Return the matrix of a program of HiGHS."""
-    import highspy
-
-    matrix = program.a_matrix_
-    kind = csc_array if matrix.format_ == highspy.MatrixFormat.kColwise else csr_array
-    return kind((matrix.value_, matrix.index_, matrix.start_), shape=(program.num_row_, program.num_col_))
-
-
-def weighted(weights: Array, table: csr_array) -> tuple[np.ndarray, Array]:
-    """Return the terms of ``weights @ table`` of a sparse ``table (r, n)``: columns and values, which are still to be
-    added up; of thousands of small tables at once that is far less than their products."""
-    row = np.repeat(weights, np.diff(table.indptr))
-    used = np.flatnonzero(row)
-    return table.indices[used], row[used] * table.data[used]
-
-
 def _split_signs(row: np.ndarray, column: np.ndarray, value: Array, n: int) -> tuple[np.ndarray, np.ndarray, Array]:
     """Return entries of the decision in its positive and its negative part."""
     return np.concatenate([row, row]), np.concatenate([column, column + n]), np.concatenate([value, -value])
-
-
-class RobustBound(NamedTuple):
-    """Lower bound of a robust program by weak duality, but for the rounding of its evaluation.
-
-    Parameters
-    ----------
-    value : float
-        The bound, as it was computed.
-    size : float
-        Sum of the absolute numbers that were added up in it.
-    rounding : float
-        Bound of the rounding error, as a share of the ``size``.
-    """
-
-    value: float
-    size: float
-    rounding: float
-
-
-def robust_bound(
-    program: FiniteProgram,
-    blocks: list[UncertainRows],
-    y: Array,
-    deviations: Array,
-    mu: Array,
-    priced: bool,
-    at: Array | None = None,
-) -> RobustBound:
-    """Return a lower bound of the cost by weak duality from multipliers ``y (r,) >= 0`` of rows at
-    ``deviations (r, Q)`` and ``mu (e,)``. It is the minimum over the bounds of the program alone. Quadratic terms are
-    replaced by their tangent ``at (n,)``, of 0 unless given. Not ``priced``: of the weighted sum of the rows, which is
-    positive only where nothing is feasible."""
-    constant, size = -add_pairwise(mu * program.b), float(np.abs(mu) @ np.abs(program.b))
-    slope, noise = mu @ program.A, np.abs(mu) @ np.abs(program.A)
-    if priced:
-        constant, size = constant + program.constant, size + abs(program.constant)
-        slope, noise = slope + program.q, noise + np.abs(program.q)
-    if priced and program.P is not None and at is not None:
-        gradient, sizes, square, square_size = tangent_terms(program.P, at)
-        constant, size = constant - square, size + square_size
-        slope, noise = slope + gradient, noise + sizes
-    none = np.zeros(0, dtype=int), np.zeros(0)
-    terms, magnitudes, longest, first = [none], [none], 2 * len(blocks) + program.b.size, 0
-    for block in blocks:
-        multipliers, w = y[first : first + block.h.size], deviations[first : first + block.h.size]
-        first += block.h.size
-        used = np.flatnonzero(multipliers)
-        if not used.size:
-            continue
-        weight, weight_size = np.zeros((2, *block.d.shape))
-        entries = (multipliers[used] * block.factor[used])[:, None] * w[used]
-        np.add.at(weight, block.part[used], entries)
-        np.add.at(weight_size, block.part[used], np.abs(entries))  # rows of one part may cancel
-        longest += int(np.bincount(block.part[used]).max())
-        terms += [weighted(multipliers, block.g), weighted(weight.ravel(), block.stacked)]
-        magnitudes += [terms[-2], weighted(weight_size.ravel(), block.stacked)]
-        constant += add_pairwise((weight * block.d).ravel()) - add_pairwise(multipliers * block.h)
-        size += float((weight_size * np.abs(block.d)).sum() + multipliers @ np.abs(block.h))
-    column, value = (np.concatenate(arrays) for arrays in zip(*terms, strict=True))
-    slope = slope + np.bincount(column, value, program.n)
-    noise_column, noise_value = (np.concatenate(arrays) for arrays in zip(*magnitudes, strict=True))
-    noise = noise + np.bincount(noise_column, np.abs(noise_value), program.n)
-    weights = program.weights if priced else np.zeros(program.n)
-    if priced and program.blocks is not None:
-        tilted = replace_norms(Terms(constant, slope, noise, weights, None, size, at), program)
-        slope, noise, weights = tilted.slope, tilted.noise, tilted.weights
-    ends = np.stack([program.lower, program.upper, np.clip(0.0, program.lower, program.upper)])
-    with np.errstate(invalid="ignore"):
-        least = (weights * np.abs(ends) + np.where(slope == 0.0, 0.0, slope * ends)).min(axis=0)
-        reach = np.where(noise > 0.0, np.abs(ends[:2]).max(axis=0), np.abs(ends[2]))
-        largest = np.where(noise + weights > 0.0, (noise + weights) * reach, 0.0)
-    bound, size = constant + add_pairwise(least), size + float(largest.sum())
-    # a slope has a term for each entry of its column; other sums are by pairs, but for those over the blocks
-    longest += int(np.bincount(column, minlength=1).max())
-    longest += 0 if program.P is None else int(np.diff(program.P.indptr).max(initial=0))
-    count = max(program.n, *(max(block.d.size, block.h.size) for block in blocks), 1)
-    rounding = bound_rounding(longest + count.bit_length())
-    return RobustBound(bound, size, rounding) if np.isfinite(bound) else RobustBound(-np.inf, size, rounding)

@@ -15,8 +15,10 @@ from scipy.sparse import csc_array, csr_array
 from sparserob_core.control.sets.sets import NormBall
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.finite import Blocks, FiniteProgram, Spread, UncertainRows, entries_of, table_of
-from sparserob_core.sip.inner.simplex import counterpart as simplex
-from sparserob_core.sip.inner.simplex.counterpart import Counterpart, Growing, RobustAnswer, robust_bound
+from sparserob_core.sip.inner.simplex import growing as simplex
+from sparserob_core.sip.inner.simplex.counterpart import Counterpart, RobustAnswer
+from sparserob_core.sip.inner.simplex.growing import GrowingProgram
+from sparserob_core.sip.inner.simplex.robust_bound import robust_bound
 
 N, Q, EMPTY = 4, 3, np.zeros(0)
 BOX = Spread(((1, Box(np.array([-0.5, -1.0]), np.array([0.5, 1.0]))), (1, Box(np.array([-0.25]), np.array([0.25])))))
@@ -161,7 +163,7 @@ def test_what_comes_late_begins_with_its_equations_met(monkeypatch: pytest.Monke
     steps, costs = {"met": 0, "slack": 0}, []
     for kind in steps:
         if kind == "slack":
-            monkeypatch.setattr(Growing, "enter", lambda *_: None)
+            monkeypatch.setattr(GrowingProgram, "enter", lambda *_: None)
         for seed in range(2):
             rng = np.random.default_rng(seed)
             base, blocks = program(rng), [rows(rng, "several") for _ in range(4)]
@@ -260,8 +262,8 @@ def test_large_programs_are_begun_from_inside_and_end_at_the_same_optimum(
     steps = solved(Counterpart(base, SPREADS[name]), blocks)
     monkeypatch.setattr(simplex, "INTERIOR_POINT_NUMBERS", 0)
     monkeypatch.setattr(simplex, "STEPS_PER_ROW_AND_COLUMN", patient)
-    ways, run = list[bool](), Growing._run_highs
-    monkeypatch.setattr(Growing, "_run_highs", lambda self, inside: ways.append(inside) or run(self, inside))
+    ways, run = list[bool](), GrowingProgram._run_highs
+    monkeypatch.setattr(GrowingProgram, "_run_highs", lambda self, inside: ways.append(inside) or run(self, inside))
     large = Counterpart(base, SPREADS[name])
     first = solved(large, blocks[:1])
     again = solved(large, blocks[1:])

@@ -4,9 +4,9 @@ import subprocess
 import sys
 
 PROGRAM = """
-from sparserob_core.sip.inner.simplex.counterpart import Growing
+from sparserob_core.sip.inner.simplex.growing import GrowingProgram
 import numpy as np
-program = Growing()
+program = GrowingProgram()
 program.variables(np.zeros(2), np.ones(2), -np.ones(2))
 assert program.solve()[0]
 print("ours")
