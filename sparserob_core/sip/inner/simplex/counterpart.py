@@ -36,6 +36,7 @@ from sparserob_core.sip.solver import AccountedSolver
 TANGENT_SHORTFALL = 1e-9
 TOUCHED = 60  # rounds of tangents: each quarters what squares are below, 30 leave 1e-18 of it
 PERTURBED = 1e-4  # of slopes: what a perturbed cost may leave; a hundredth of it is seen, and 1e-2 is another entry's
+CORRECTIONS = 3  # of multipliers by least squares: the first two meet nearly all, and each takes as long as a round
 # Of least squares within bounds, at most: what is left of a slope after some lowers a bound, which holds
 LEAST_SQUARES_PASSES = 20
 # Numbers in the table of rows that may get a multiplier; larger ones are left as they are. Ten times as many take
@@ -412,19 +413,21 @@ class Counterpart:
         if not active.size:
             return
         rows = csr_array(vstack([block.g for block in self.blocks]))
-        balanced = self._balance_at_bounds(slope + y @ rows, weights)
-        residual = slope + y @ rows - balanced
         answering = np.concatenate([C.indices for block in self.blocks for C in block.C])
-        # of an answer that is no vertex, entries near a bound or near 0 have slopes of their own
-        is_corrected = np.abs(residual) <= PERTURBED * max(1.0, float(np.abs(slope).max(initial=0.0)))
-        is_corrected &= (residual != 0.0) | self._find_inner_variables()
-        is_corrected[answering] = False
-        columns = np.flatnonzero(is_corrected)
-        if np.abs(residual[columns]).max(initial=0.0) <= HIGHS_ACCURACY:
-            return
-        shares = rows[active][:, columns].T.toarray() * sizes[active]
-        change = sizes[active] * np.linalg.lstsq(shares, -residual[columns], rcond=SAME_POINT_DISTANCE)[0]
-        y[active] = np.maximum(y[active] + change, 0.0)
+        is_inner, is_corrected = self._find_inner_variables(), np.zeros(self.program.n, dtype=bool)
+        for _ in range(CORRECTIONS):  # what one of them corrects may draw other variables
+            balanced = self._balance_at_bounds(slope + y @ rows, weights)
+            residual = slope + y @ rows - balanced
+            # of an answer that is no vertex, entries near a bound or near 0 have slopes of their own
+            is_small = np.abs(residual) <= PERTURBED * max(1.0, float(np.abs(slope).max(initial=0.0)))
+            is_corrected |= is_small & ((residual != 0.0) | is_inner)
+            is_corrected[answering] = False
+            columns = np.flatnonzero(is_corrected)
+            if np.abs(residual[columns]).max(initial=0.0) <= HIGHS_ACCURACY:
+                return
+            shares = rows[active][:, columns].T.toarray() * sizes[active]
+            change = sizes[active] * np.linalg.lstsq(shares, -residual[columns], rcond=SAME_POINT_DISTANCE)[0]
+            y[active] = np.maximum(y[active] + change, 0.0)
         if np.abs(slope - balanced + y @ rows)[columns].max() > HIGHS_ACCURACY:
             self._enter_tight_rows(slope, weights, balanced, rows, (sizes > 0.0), columns, y)
 
