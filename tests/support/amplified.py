@@ -14,7 +14,7 @@ import numpy as np
 
 import sparserob_core as sr
 
-BITS = 256  # 77 digits: of a growth of e^40 60 are left
+BITS = 256  # 77 digits: of a growth of e^60 50 are left
 INSIDE = 4  # parts of a piece at whose ends the state is looked at
 EXCUSED = 1e-9  # of the size of a row
 
