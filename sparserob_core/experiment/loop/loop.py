@@ -37,7 +37,6 @@ from sparserob_core.sip.program import TOLERANCE
 LOOPS, RESOLVED_LOOPS = 10, 1  # numbers of loops of every law by default, without and with a re-solve
 SHOWN, DRAWN = 400, 3  # numbers of times, and of loops of every law, in the figure
 CONTROL, STEP = "control", "control_step"
-CONTROL_ROUNDING = 1e-12  # of the size of the set of controls
 
 # law, disturbance (1, mw, M) of every period, parameter (1, nu), parameters of a system that depends on the time
 # (1, d, size), state (1, d), noise (K, p) of every period

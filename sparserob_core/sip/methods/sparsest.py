@@ -47,7 +47,6 @@ from sparserob_core.sip.working.tightening import PAID
 
 PROVEN = ("certified", "verified")
 PROPOSALS = 40  # of the mixed-integer solver
-PROGRAM_SECONDS = 20.0  # that one of its programs may take
 # Relative gap of a proposal while none is proven. With a tenth of it a limit of seconds is over before the first one;
 # with ten times as much it is no different: any decision is closer to the least.
 ANY = 1.0

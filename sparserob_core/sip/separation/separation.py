@@ -39,9 +39,39 @@ MAX_ARRAY = 2_000_000
 def separate(
     program: SemiInfiniteProgram, x: Array, tools: Tools, threshold: float = 1e-9, number: int = 0
 ) -> list[tuple[ConstraintFamily, Separation]]:
-    """The most violated indices of every family at ``x (n,)``: in the family's own way, or as they are searched for (in
-    round ``number``; `search_worst`), the harder the less is found: as long as nothing of any family is violated by
-    more than ``threshold``. Raises `OutOfTime` when the deadline of the tools has passed."""
+    """Return the most violated indices of every family at ``x (n,)``, worst first.
+
+    A family that knows its own way is asked. Of others the largest local maxima of the violation of every row are
+    searched for: as many as the decision has variables, and at least 8. A grid of the index box brackets them (257
+    points for one coordinate that moves, 33 x 33, 13^3, 7^4; 2048 random points beyond), and the most promising are
+    refined to about 1e-13 in the violation.
+
+    As long as nothing of any family is violated by more than ``threshold``, the search goes on: all others are refined
+    that may exceed it, then those of a grid of four times the budget, then the local maxima around the indices for
+    which the maximiser asks. So rounds that find cuts are cheap, and the last one is searched hard.
+
+    A search proves nothing: ``bound`` is ``inf`` unless the maximiser proved one, or the index set is a single point.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    x : ndarray, shape (n,)
+        The decision.
+    tools : Tools
+        The maximiser, the budget, the deadline and who is told.
+    threshold : float
+        The violation above which a search ends.
+    number : int
+        The round, for events.
+
+    Raises
+    ------
+    InputError
+        If a row is not a number, or an index set is unbounded.
+    OutOfTime
+        If the deadline of the tools has passed.
+    """
 
     def search(family: ConstraintFamily) -> _ViolationSearch:
         notify = forward_events(
@@ -70,25 +100,6 @@ def separate(
         )
         for family, answer in separations
     ]
-
-
-def search_worst(family: ConstraintFamily, x: Array, tools: Tools, threshold: float = 1e-9) -> Separation:
-    """The largest local maxima of the violation of every row of ``family`` at the decision ``x (n,)``, as many per row
-    as the decision has variables (at least 8), worst first.
-
-    A grid of the index box (257 points for one coordinate that moves, 33 x 33, 13^3, 7^4; 2048 random points beyond),
-    finer where it does not resolve the violation, brackets the local maxima; the most promising are refined at once, to
-    about 1e-13 in the violation. Only when nothing above ``threshold`` was found are all others refined that may exceed
-    it; then those of a grid of four times the budget of the tools; and then their maximiser is asked, for as many
-    further indices as the budget says, of which again all local maxima are refined. So the rounds of an exchange that
-    find cuts stay cheap, and the last one is searched hard.
-
-    A search proves nothing: ``bound`` is ``inf`` unless the maximiser proved one, or the index set is a single point.
-    Raises `InputError` when a row is not a number or the index set is unbounded, and `OutOfTime` past the deadline.
-    """
-    search = _ViolationSearch(family, x, tools, threshold)
-    _search_harder([search], search.highest)
-    return search.result()
 
 
 def _search_harder(searches: Sequence[_ViolationSearch], highest: float) -> None:

@@ -117,25 +117,6 @@ def prices_of(program: SemiInfiniteProgram) -> Array:
     return prices
 
 
-@shaped
-def find_acting_entries(coefficients: Float[Array, "m n"], values: Float[Array, "n k"]) -> np.ndarray:
-    """Return where ``coefficients @ values`` is not 0, except for the rounding of the sum.
-
-    Parameters
-    ----------
-    coefficients : ndarray, shape (m, n)
-        Coefficients.
-    values : ndarray, shape (n, k)
-        Values.
-
-    Returns
-    -------
-    ndarray of bool, shape (m, k)
-        True where the product is not 0.
-    """
-    return np.asarray(np.abs(coefficients @ values) > NEGLIGIBLE_ENTRY * (np.abs(coefficients) @ np.abs(values)))
-
-
 def counting(program: SemiInfiniteProgram) -> int:
     """Return the number of first entries of a decision that determine the images that count.
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import sparserob_core as sr
 from sparserob_core.sip.maximiser import Maximiser
 from sparserob_core.sip.method import Tools
-from sparserob_core.sip.separation.separation import KEPT_PER_ROW, search_worst, separate
+from sparserob_core.sip.separation.separation import KEPT_PER_ROW, separate
 from sparserob_core.sip.solver import Auto
 
 DECISION = np.array([1.0])
@@ -32,6 +32,11 @@ def family(violation, lower, upper):
 
 def tools(maximiser=None, budget=0):
     return Tools(solver=Auto(), maximiser=maximiser, budget=budget)
+
+
+def search_worst(made_up, x, given):
+    ((_, found),) = separate(sr.SemiInfiniteProgram(n=x.size, families=[made_up]), x, given)
+    return found
 
 
 def worst(violation, lower, upper, maximiser=None, budget=0):
