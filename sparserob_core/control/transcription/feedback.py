@@ -170,7 +170,6 @@ class FeedbackModel(Acting):
             measurements.observer,
             anew=_has_next_initial_state(posed),
         )
-        system, horizon = functionals.response.system, problem.horizon
         families = [FeedbackConstraint.of(constraint, loop).family() for constraint in posed.constraints]
         settle_functions: list[Callable[[Array], Array]] = []
         if measurements.fixed[1].size:
@@ -217,7 +216,7 @@ class FeedbackModel(Acting):
             among = (build_program(posed, peak).program, first)
         return ProgramPart(
             families=[
-                replace(family, hindrance=lambda low, high: "" if loop.inner.acts else hindrance(system, horizon))
+                replace(family, hindrance=lambda low, high: hindrance(functionals.response, problem.horizon))
                 for family in families
             ],
             lower=lower,

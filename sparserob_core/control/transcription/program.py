@@ -171,10 +171,10 @@ def final_errors(posed: Posed) -> Callable[[Array], EqualityErrors]:
         constraint = FlatConstraint(EQUALS, nominal, *sides, *ends, ParameterIndex(None))
         error = float(constraint.enclosure(x, horizon[None], horizon[None]).bounds[0])
         error = error if (sizes > 0.0).any() else 0.0
-        system, end = posed.functionals.response.system, posed.problem.horizon
+        response, end = posed.functionals.response, posed.problem.horizon
         advice = (
             f"the fixed final states may be missed by up to {error:.1e} of their sizes, {TOLERANCE:g} is excused;"
-            f" {hindrance(system, end) or 'wider final sets would help'}"
+            f" {hindrance(response, end) or 'wider final sets would help'}"
         )
         return EqualityErrors(error * sizes / unit, TOLERANCE * sizes / unit, advice)
 
@@ -412,7 +412,7 @@ def _build_reduced_family(constraint: StateConstraint) -> ConstraintFamily:
         cells=constraint.cells,
         gradient=Sensitivity(constraint).gradient,
         explain=constraint.explain,
-        hindrance=lambda lower, upper: hindrance(response.system, float(response.grid.breakpoints[-1])),
+        hindrance=lambda lower, upper: hindrance(response, float(response.grid.breakpoints[-1])),
         measured=constraint.measured,
         along=constraint.functionals.names.time,
         source=constraint,

@@ -11,6 +11,7 @@ from sparserob_core.control.problem.system import System
 from sparserob_core.control.reach.support import WITHOUT_PROOF
 from sparserob_core.control.response.orbit import NOTABLE, growth
 from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.response.response import Response
 from sparserob_core.control.sets.strangers import strangers
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.terms.in_time import within_reach
@@ -21,6 +22,9 @@ from sparserob_core.sip.result import Result
 
 # That the search takes for a problem that cannot be proven, unless a limit is given: for a witness
 UNPROVABLE_SECONDS = 30.0
+# Exponent of what a plant grows by between two answers of an inner loop, from which more pieces are advised: random
+# plants are decided below it, and some are not at three times as much
+GROWS_BETWEEN = 1.0
 PROBED_CELL_SHARE = 1e-6  # of the parameters: a cell on which a system that can be enclosed at all will be
 
 
@@ -75,7 +79,7 @@ def add_assumptions(model: Transcription, result: Result) -> Result:
     if result.status in ("certified", "verified"):
         remarks = [unproven_assumptions(model.problem), *promised(model)]
     else:
-        advice = hindrance(model.problem.system, model.problem.horizon)
+        advice = hindrance(model.response, model.problem.horizon)
         remarks = [] if result.status == "infeasible" or advice in result.message else [advice]
     added = [text for text in remarks if text and text not in result.message]
     return replace(result, message="; ".join([result.message, *added])) if added else result
@@ -102,17 +106,33 @@ def promised(model: Transcription) -> list[str]:
     name, units = problem.names.state(state), problem.names.state_units
     distance = f"{moved[state]:.1g} {units[state]}" if state < len(units) else f"{moved[state]:.1g}"
     digits = f"in open loop an error in the last digit of the control ends up to {distance} off in {name}"
-    return [f"{digits}; feedback with prestabilise does not let it grow"]
+    return [
+        f"{digits}; feedback with prestabilise does not let it grow" if _takes_inner_loop(problem.system) else digits
+    ]
 
 
-def hindrance(system: System, horizon: float) -> str:
-    """Return the property of a system that keeps the bounds of a cell wide however small the cell is, and what would
-    help; empty where the system is not the cause."""
+def hindrance(response: Response, horizon: float) -> str:
+    """Return the property of a plant that keeps the bounds of a cell wide however small the cell is, and what would
+    help; empty where the plant is not the cause."""
+    system, grid = response.system, response.grid
     exponent = growth(system, horizon)
     if exponent < NOTABLE:
         return ""
+    if response.inner.acts:
+        between = growth(system, float(np.bincount(grid.control_piece, grid.lengths).max()))
+        statement = f"between two answers of the inner loop the plant amplifies by e^{between:.1f}"
+        return f"{statement}; more pieces of the control would help" if between >= GROWS_BETWEEN else ""
     size = f"e^{exponent:.0f} = {np.exp(min(exponent, 700.0)):.1g}"
+    remedies = "a shorter horizon or wider sets"
+    if _takes_inner_loop(system):
+        remedies = "a shorter horizon, wider sets, or feedback with policy.prestabilise: auto"
     return (
         f"the plant amplifies by {size} over the horizon, and double precision resolves {np.finfo(float).eps:.0e} of"
-        " that; a shorter horizon, wider sets, or feedback with policy.prestabilise: auto would help"
+        f" that; {remedies} would help"
     )
+
+
+def _takes_inner_loop(system: System) -> bool:
+    """Return whether feedback with an inner loop is built for a system: a known one, without entries in time and
+    without a delay."""
+    return not (system.parameter_count or system.varies or system.delay)

@@ -8,6 +8,9 @@ import pytest
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.response.inner_loop import NO_INNER_LOOP, InnerLoop
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.time_grid import merge_grids
 from sparserob_core.control.sets.sets import Ellipsoid
 from sparserob_core.control.transcription.provable import growth, hindrance, unprovable
 from sparserob_core.sip.convex_set import Box
@@ -70,8 +73,35 @@ def test_nothing_stands_against_other_proofs(made):
     assert unprovable(made()) is None
 
 
+def response(system, horizon, breakpoints=(0.0, 0.5, 1.0), inner=NO_INNER_LOOP):
+    times = horizon * np.array(breakpoints)
+    return Response(system, merge_grids(times, times), np.zeros(system.states), inner=inner)
+
+
 def test_growth_over_the_horizon_is_named_where_it_matters():
-    assert growth(LinearSystem([[3.0]], [[1.0]]), 5.0) == pytest.approx(15.0)
+    fast = LinearSystem([[3.0]], [[1.0]])
+    assert growth(fast, 5.0) == pytest.approx(15.0)
     assert growth(KNOWN, 100.0) <= 1e-12
-    assert not hindrance(KNOWN, 100.0)
-    assert "e^15" in hindrance(LinearSystem([[3.0]], [[1.0]]), 5.0)
+    assert not hindrance(response(KNOWN, 100.0), 100.0)
+    assert "e^15" in hindrance(response(fast, 5.0), 5.0)
+
+
+@pytest.mark.parametrize(
+    ("more", "is_offered"),
+    [({}, True), ({"delay": 0.1}, False), ({"parameters": Box([0.0], [1e-9])}, False)],
+)
+def test_an_inner_loop_is_advised_only_for_plants_that_it_is_built_for(more, is_offered):
+    system = LinearSystem((lambda p: np.array([[3.0 + p[0]]])) if "parameters" in more else [[3.0]], [[1.0]], **more)
+    advice = hindrance(response(system, 5.0), 5.0)
+    assert "e^15" in advice and ("prestabilise" in advice) == is_offered
+
+
+@pytest.mark.parametrize(
+    ("breakpoints", "grown"),
+    [((0.0, 0.5, 1.0), "e^7.5"), ((0.0, 0.2, 1.0), "e^12.0"), (np.linspace(0.0, 1.0, 16), "e^1.0"), (40, "")],
+)
+def test_beside_an_inner_loop_more_pieces_are_advised_where_the_plant_grows_between_its_answers(breakpoints, grown):
+    times = np.linspace(0.0, 1.0, breakpoints) if isinstance(breakpoints, int) else breakpoints
+    inner = InnerLoop(np.full((len(times) - 1, 1, 1), -4.0), np.ones(1))
+    advice = hindrance(response(LinearSystem([[3.0]], [[1.0]]), 5.01, times, inner), 5.01)
+    assert (grown in advice and "more pieces" in advice and "prestabilise" not in advice) if grown else not advice
