@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from scipy.linalg import expm
 
 import sparserob_core as sr
 from sparserob_core.errors import InputError, SparseRobError
+from sparserob_core.experiment.run.conclusion.bound import NO_TIME, unbounded
+from sparserob_core.sip.result import MEANING
 from tests.known_answers.test_unstable import amplified, fixed_end, verdicts, wall
 from tests.support.amplified import drawn, drawn_far, exceeded
 from tests.support.oracle import bounds_of
@@ -374,3 +377,24 @@ def test_plans_of_the_remaining_horizon_cost_what_they_cost_from_there(tmp_path:
         state = flow[:2, :2] @ state + flow[:2, 2] * (u + rng.uniform(-0.1, 0.1))
         assert controller.covered and abs(state[0]) <= 0.5
     assert resolved == 2
+
+
+@pytest.mark.parametrize("horizon", [16.0, 19.0])
+def test_an_undecided_run_writes_the_bound_that_its_multipliers_prove(horizon: float, tmp_path: Path) -> None:
+    """Of five pieces each multiplies by up to e^11. It was 3 % above that bound, and the inner loop was advised."""
+    problem = amplified(horizon, "affine", terminal=[{"equals": [-0.4, 0]}], control={"box": 1e5})
+    problem.options["dictionaries"]["control"]["pieces"] = 5
+    problem.options["policy"] |= {"cost": "peak", "prestabilise": "auto", "causal_signals": 0}
+    outcome = run(problem.options, tmp_path / "run")
+    assert outcome.status == "undecided" and verdicts(outcome)["lower bound"] == "holds"
+    assert 0.9 * outcome.result.cost < outcome.result.lower_bound <= outcome.result.cost
+    message = outcome.summary["message"]
+    assert "prestabilise" not in message and message.endswith("more pieces of the control would help")
+
+
+def test_a_claim_whose_bound_has_no_time_names_the_gap_that_is_left(tmp_path: Path) -> None:
+    certified = run(posed(problem={"initial_state": [0.3, 0.0]}, policy={"cost": "nominal"}), tmp_path / "run").result
+    for status in ("certified", "verified"):
+        left = unbounded(replace(certified, status=status, message=f"{MEANING[status]} (gap 1.0e-09); a limit"))
+        assert left.status == "verified" and left.lower_bound == 0.0 and left.gap == 1.0
+        assert left.message.startswith(f"{MEANING['verified']} (gap 1.0e+00); {NO_TIME}")

@@ -17,7 +17,7 @@ from sparserob_core.sip.inner.solve import ADVICE
 from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import TOLERANCE
 from sparserob_core.sip.proof.verdict import verdict
-from sparserob_core.sip.result import Result
+from sparserob_core.sip.result import MEANING, Result
 
 BOUND_SECONDS = 10.0  # for a bound in ball arithmetic, where another bound holds too; where none does there is no limit
 NO_TIME = "there was no time to see what the multipliers prove without rounding"
@@ -47,13 +47,15 @@ def unbounded(result: Result) -> Result:
     """Return a result without multipliers, for a run that has no time to see what they prove.
 
     The lower bound is 0, as no term of a cost is negative. An infeasible result becomes ``undecided``, a certified one
-    ``verified``.
+    ``verified``. The message of a claim names the gap that is left.
     """
     bare = replace(result, dual=NO_BOUND, lower_bound=0.0)
     if result.status == "infeasible":
         return replace(bare, status="undecided", message=NO_TIME, infeasible=None, decision=None)
-    if result.status == "certified":
-        return replace(bare, status="verified", message=f"{result.message}; {NO_TIME}")
+    if result.status in ("certified", "verified"):
+        message = f"{MEANING['verified']} (gap {bare.gap:.1e}); {NO_TIME}"
+        ending = result.message.partition("; ")[2] if result.status == "verified" else ""
+        return replace(bare, status="verified", message="; ".join(filter(None, [message, ending])))
     return bare
 
 
@@ -68,18 +70,20 @@ def _derive_bound(experiment: ControlExperiment, result: Result, deadline: Deadl
     that are no boxes give the worst deviations of a policy. No running bound has the error of these points. The second:
     there are errors of execution, whose integrals a running bound estimates by shares. The third: an inner loop acts
     beside the decision, and the rows of a running bound are those of the plant with it. No other bound is reported in
-    these cases, however long it takes. Raises `sparserob_core.sip.limits.deadline.OutOfTime` where the time of the run
-    is over before.
+    these cases, however long it takes; undecided results have one, too. Raises
+    `sparserob_core.sip.limits.deadline.OutOfTime` where the time of the run is over before.
     """
     tolerance = experiment.gap_tolerance
     weights = None if any(counting(experiment.loaded)) else experiment.program.finite.weights
     rounded = reduce_bound(experiment.transcription, result, tolerance, weights)
-    if result.status not in ("certified", "verified") or tolerance is None or result.stopped:
-        return rounded
     feedback = experiment.transcription.feedback
     exact = experiment.problem.delivery is None and (
         feedback is None or (feedback.loop.spread.is_box and not feedback.loop.inner.acts)
     )
+    is_claimed = result.status in ("certified", "verified")
+    is_written = is_claimed or (result.status == "undecided" and not exact)
+    if not is_written or tolerance is None or result.stopped:
+        return rounded
     if exact and rounded.gap <= tolerance + SMALL_GAP:
         return rounded
     data = certificate(experiment, rounded)
@@ -97,12 +101,14 @@ def _derive_bound(experiment: ControlExperiment, result: Result, deadline: Deadl
         if not exact:
             deadline.check()
         return rounded
-    if derived - result.cost > _compute_allowance(result):
+    if is_claimed and derived - result.cost > _compute_allowance(result):
         return replace(rounded, status="failed", message=CROSSED.format(derived, result.cost, ADVICE))
     lowered = min(derived - BOUND_ALLOWANCE * abs(derived), result.cost)
     if not np.isfinite(lowered) or (lowered <= rounded.lower_bound if exact else lowered == rounded.lower_bound):
         return rounded
     improved = replace(rounded, lower_bound=lowered, dual=replace(rounded.dual, bound=lowered))
+    if not is_claimed:
+        return improved
     status, message = verdict(result.proofs, improved.gap, tolerance)
     ending = result.message.partition("; ")[2]  # why the method came to an end
     message = f"{message}; {ending}" if ending and status != "certified" else message
