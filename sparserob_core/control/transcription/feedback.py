@@ -93,9 +93,17 @@ class FeedbackModel(Acting):
         return self.policy
 
     def in_own(self, theirs: Posed, own: Posed, units: Units) -> FeedbackModel:
-        """Return this control with its measurements in the problem's ``own`` units."""
-        measurements = self.first[1] if own is self.first[0] else _build_measurements(self.mask, theirs, own, units)[0]
-        return replace(self, measurements=measurements)
+        """Return this control with its measurements in the problem's ``own`` units.
+
+        In other own units than the first ones, the coordinates of the gains stay those of the user's units: a decision
+        is converted entry by entry.
+        """
+        if own is self.first[0]:
+            return replace(self, measurements=self.first[1])
+        built, outputs = _build_measurements(self.mask, theirs, own, units)
+        assert built.deviations is not None
+        answers = _scale_to_user_units(self.measurements.answers, 1.0 / outputs, 1.0 / built.deviations)
+        return replace(self, measurements=replace(built, answers=answers))
 
     def widen(self, posed: Posed, around: Array) -> Posed:
         """Return the problem with the range that the decided part of the control has from its initial state, and from
